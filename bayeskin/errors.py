@@ -24,6 +24,14 @@ class InputError(ValueError):
         super().__init__(f"{self.where}: found {self.found}; expected {self.expected}")
 
 
+class CannotWrite(InputError):
+    """A file cannot be written, for example because the disk is full or the permission is missing."""
+
+    def __init__(self, path: object, error: OSError) -> None:
+        super().__init__(path, f"a file that cannot be written ({error.strerror})", "a file to write to")
+        self.args = (f"cannot write {self.where}: {error.strerror}",)
+
+
 class Unavailable(InputError):
     """Something that a run needs, such as a server, is not available at present.
 

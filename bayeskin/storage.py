@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from bayeskin import types
-from bayeskin.errors import InputError
+from bayeskin.errors import CannotWrite, InputError
 
 T = TypeVar("T")
 FORMAT = "bayeskin"
@@ -71,9 +71,7 @@ def write_bytes(path: Path, contents: bytes) -> None:
             os.fsync(out.fileno())
         os.replace(partial, path)
     except OSError as error:
-        raise InputError(
-            path, f"a file that cannot be written ({error.strerror})", "free space and write permission"
-        ) from None
+        raise CannotWrite(path, error) from None
     finally:
         partial.unlink(missing_ok=True)
 

@@ -38,7 +38,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bayeskin import storage
-from bayeskin.errors import InputError
+from bayeskin.errors import CannotWrite, InputError
 from bayeskin.hashing import sha256_of
 
 T = TypeVar("T")
@@ -145,7 +145,7 @@ class Store:
         except BaseException as error:
             self._file.truncate(self._end)
             if isinstance(error, OSError):
-                raise _cannot_write(self.path, error) from None
+                raise CannotWrite(self.path, error) from None
             raise
         self._end += len(text)
 
@@ -217,7 +217,7 @@ def _opened(path: Path) -> FileIO:
         path.parent.mkdir(parents=True, exist_ok=True)
         return FileIO(path, "a+")
     except OSError as error:
-        raise _cannot_write(path, error) from None
+        raise CannotWrite(path, error) from None
 
 
 def _lock(file: FileIO, path: Path) -> None:
@@ -225,7 +225,7 @@ def _lock(file: FileIO, path: Path) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX)
     except OSError as error:
-        raise _cannot_write(path, error) from None
+        raise CannotWrite(path, error) from None
 
 
 def _is_at(file: FileIO, path: Path) -> bool:
@@ -233,9 +233,3 @@ def _is_at(file: FileIO, path: Path) -> bool:
     with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     return False
-
-
-def _cannot_write(path: Path, error: OSError) -> InputError:
-    """Returns the error of a file that cannot be written."""
-    found = f"a file that cannot be written ({error.strerror})"
-    return InputError(path, found, "free space and write permission")

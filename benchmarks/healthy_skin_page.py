@@ -18,9 +18,10 @@ from typing import Any
 import rows
 from demo_gallery import FIGURES, ROOT, called, smaller
 
+from bayeskin.types import PHASE_KINDS
+
 PAGE = ROOT / "docs" / "mismatch-scoreboard.md"
 WHOLE_MN, HELD_OUT_MN = "9 mN", "18 mN"  # the aims of this project on this recording
-KINDS = ("rest", "load", "hold", "unload")
 RUNS = {
     "healthy-skin": ("located", "before_after", "candidates"),
     "healthy-skin-article": ("before_after", "contributions"),
@@ -32,7 +33,7 @@ def fits(answer: Mapping[str, Any]) -> str:
     fit_pair, full = [answer["fit"][when] for when in ("before", "after")], answer["full_model"]
     table = [
         ["RMSE over the whole recording", *_mn(fit_pair, "rmse"), WHOLE_MN],
-        [f"RMSE by phase: {' / '.join(KINDS)}", *(_by_phase(fit) for fit in fit_pair), ""],
+        [f"RMSE by phase: {' / '.join(PHASE_KINDS)}", *(_by_phase(fit) for fit in fit_pair), ""],
         ["RMSE after the second hold, of a fit up to its end", *_mn(fit_pair, "rmse_held_out"),
          HELD_OUT_MN],
         ["full model at the best values, RMSE", "",
@@ -82,7 +83,7 @@ def _mn(some: list[Mapping[str, Any]], what: str) -> list[str]:
 
 def _by_phase(fit: Mapping[str, Any]) -> str:
     """Returns the RMSE of each kind of phase in mN as text."""
-    return " / ".join(f"{1e3 * fit['rmse_by_phase'][kind]:.0f}" for kind in KINDS) + " mN"
+    return " / ".join(f"{1e3 * fit['rmse_by_phase'][kind]:.0f}" for kind in PHASE_KINDS) + " mN"
 
 
 def main() -> None:

@@ -27,8 +27,7 @@ from bayeskin.execution.local import Lost, run_parallel
 from bayeskin.finite_element import simulate
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.inference.model_error import ErrorSizes, errors, shapes
-from bayeskin.mismatch.stiffness_ratio import STIFFEST_BELOW
-from bayeskin.types import Array
+from bayeskin.types import STIFFEST_BELOW, Array
 
 SEED = 21
 BIN_S = 0.5

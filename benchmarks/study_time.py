@@ -11,18 +11,15 @@ values beside the intervals. A second start with the same folder continues, and 
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rows
-from unknown_protocol import RATE_HZ, TRUTH, covered, noise
+from noisy_recordings import inside_intervals, random_skin, save_noisy_recording
 
-from bayeskin import storage
-from bayeskin.finite_element import ModelSpec, simulate
-from bayeskin.types import PadMotion, Recording
+from bayeskin.types import PadMotion
 from bayeskin.workflow.folder import read_record
 from bayeskin.workflow.study import study
 
@@ -43,20 +40,11 @@ draws = 8
 def make(folder: Path, subject: int) -> tuple[str, str, dict[str, float]]:
     """Writes a subject's recording, if it does not exist, and returns its name, its group and its skin."""
     rng, group = np.random.default_rng([subject, 31]), GROUPS[subject % 2]
-    theta = {
-        name: value if name == "p_init" else float(value * np.exp(SPREAD * rng.standard_normal()))
-        for name, value in TRUTH.items()
-    }
+    theta = random_skin(rng, SPREAD)
     theta["E_c"] *= FACTOR if group == GROUPS[1] else 1.0
     file = folder / f"s{subject:02d}.h5"
     if not file.exists():
-        simulation = simulate(ModelSpec(), MOTION, theta)
-        if simulation.status != "ok":
-            raise SystemExit(simulation.message)
-        time_s = np.arange(0.0, MOTION.time_s[-1] + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
-        force_n = simulation.at(time_s) + noise(rng, len(time_s))
-        sha256 = hashlib.sha256(force_n.tobytes()).hexdigest()
-        storage.save(file, Recording(time_s, MOTION.at(time_s), force_n, file.stem, sha256))
+        save_noisy_recording(file, rng, MOTION, theta)
     return file.stem, group, theta
 
 
@@ -77,10 +65,10 @@ def report(answer: Mapping[str, Any], folder: Path, skins: Mapping[str, Mapping[
     table += [["all recordings", stage, f"{s:.0f}"] for stage, s in own.items()]
     table.append(["one recording", "all", f"{sum(own.values()) / len(skins):.0f}"])
     print(rows.markdown(["of", "stage", "process seconds"], table))
-    for one in answer["recordings"]:
-        if "alone" in one:
-            print(one["name"], one["group"])
-            table = covered(one["alone"], skins[one["name"]])
+    for recording in answer["recordings"]:
+        if "alone" in recording:
+            print(recording["name"], recording["group"])
+            table = inside_intervals(recording["alone"], skins[recording["name"]])
             print(rows.markdown(["", "true", "5 %", "95 %", "inside"], table))
     print(answer["text"])
 
@@ -93,13 +81,13 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    made = [make(options.folder, subject) for subject in range(options.subjects)]
-    lines = [f"{name}.h5,{name},{group}" for name, group, _ in made]
+    skins = [make(options.folder, subject) for subject in range(options.subjects)]
+    lines = [f"{name}.h5,{name},{group}" for name, group, _ in skins]
     (options.folder / "table.csv").write_text("\n".join(["recording,subject,group", *lines]) + "\n")
     config = options.folder / "study.toml"
     config.write_text(STUDY)
     answer = study(config, rows.Log())
-    report(answer, options.folder, {name: theta for name, _, theta in made})
+    report(answer, options.folder, {name: theta for name, _, theta in skins})
 
 
 if __name__ == "__main__":

@@ -12,42 +12,24 @@ folder continues, and repeats nothing.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import resource
 import tempfile
 import time
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rows
-from scipy.signal import lfilter
+from noisy_recordings import inside_intervals, random_skin, save_noisy_recording
 
-from bayeskin import storage
-from bayeskin.finite_element import ModelSpec, simulate
-from bayeskin.types import Array, PadMotion, Recording
+from bayeskin.types import PadMotion
 from bayeskin.workflow.new import new_config
 from bayeskin.workflow.stages import BEFORE_REPORT, run
 
-TRUTH = {"E_c": 300e3, "E_s": 20e3, "k_c": 3e-14, "k_s": 2e-13, "p_init": 300.0}
 SPREAD = 0.3  # sd of the logarithms of a seed's skin about `TRUTH`
 REST_S, STEP_MM, STEPS, SPEED_MM_S = 5.0, 3.0, 3, 1.0
 HOLDS_S = (20.0, 40.0)
-RATE_HZ = 20.0
-WHITE_N, SLOW_N, SLOW_S = 4e-3, 2e-3, 0.5  # sd of white noise, sd and correlation time of slow noise
-
-
-def skin(rng: np.random.Generator) -> dict[str, float]:
-    """Returns the parameters of a random skin about `TRUTH`, in SI units.
-
-    The initial pressure is that of `TRUTH`.
-    """
-    return {
-        name: value if name == "p_init" else float(value * np.exp(SPREAD * rng.standard_normal()))
-        for name, value in TRUTH.items()
-    }
 
 
 def staircase(rng: np.random.Generator) -> PadMotion:
@@ -61,25 +43,12 @@ def staircase(rng: np.random.Generator) -> PadMotion:
     return PadMotion(np.array(time_s), 1e-3 * np.array(height_mm))
 
 
-def noise(rng: np.random.Generator, count: int) -> Array:
-    """Returns noise (count,) [N] for `count` samples."""
-    correlation = np.exp(-1.0 / (RATE_HZ * SLOW_S))
-    slow = lfilter([SLOW_N * np.sqrt(1.0 - correlation**2)], [1.0, -correlation], rng.standard_normal(count))
-    return np.asarray(WHITE_N * rng.standard_normal(count) + slow)
-
-
 def make(file: Path, seed: int) -> dict[str, float]:
     """Writes a seed's recording, if it does not exist, and returns the parameters of its skin."""
     rng = np.random.default_rng([seed, 30])
-    theta, motion = skin(rng), staircase(rng)
+    theta, motion = random_skin(rng, SPREAD), staircase(rng)
     if not file.exists():
-        simulation = simulate(ModelSpec(), motion, theta)
-        if simulation.status != "ok":
-            raise SystemExit(simulation.message)
-        time_s = np.arange(0.0, motion.time_s[-1] + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
-        force_n = simulation.at(time_s) + noise(rng, len(time_s))
-        sha256 = hashlib.sha256(force_n.tobytes()).hexdigest()
-        storage.save(file, Recording(time_s, motion.at(time_s), force_n, file.stem, sha256))
+        save_noisy_recording(file, rng, motion, theta)
     return theta
 
 
@@ -105,17 +74,6 @@ def stage_by_stage(config: Path) -> tuple[list[list[str]], dict[str, Any]]:
     return table, summary
 
 
-def covered(posterior: Mapping[str, Mapping[str, Any]], theta: Mapping[str, float]) -> list[list[str]]:
-    """Returns a table row of each parameter: true value, 90 % interval, and whether it contains the value."""
-    return [
-        [
-            name, *(f"{value:.4g}" for value in (theta[name], p["low_90"], p["high_90"])),
-            "yes" if p["low_90"] <= theta[name] <= p["high_90"] else "no",
-        ]
-        for name, p in posterior.items() if name in theta
-    ]  # fmt: skip
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -132,7 +90,7 @@ def main() -> None:
             new_config([folder / "staircase.h5"])
         table, summary = stage_by_stage(config)
     print(rows.markdown(["stage", "seconds", "CPU seconds"], table))
-    print(rows.markdown(["", "true", "5 %", "95 %", "inside"], covered(summary["posterior"], theta)))
+    print(rows.markdown(["", "true", "5 %", "95 %", "inside"], inside_intervals(summary["posterior"], theta)))
     for check in summary["full_model_at_draws"]:
         print(check["message"])
     polished = summary["map"]["polished"] or {"full_runs": 0}

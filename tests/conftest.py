@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import pytest
 
 from bayeskin import cli
+
+if TYPE_CHECKING:
+    from toys.browser import Browser
 
 pytest.register_assert_rewrite("toys")
 
@@ -50,3 +54,12 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from toys.command_line import measured_csv
 
     return measured_csv(tmp_path_factory.mktemp("measured") / "measured.csv")
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """A browser without a window, in which a test opens pages."""
+    from toys.browser import opened_browser
+
+    with opened_browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser

@@ -13,6 +13,7 @@ from scipy.stats import binom
 
 from bayeskin.proof import score, seals
 from bayeskin.proof.scoring.curves import curve
+from bayeskin.types import PHASE_KINDS
 
 
 def test_the_page_of_mechanisms_has_the_catalogue_as_it_is(benchmark):
@@ -59,7 +60,7 @@ def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
     page = benchmark("healthy_skin_page")
     fits = {
         when: {"rmse": rmse, "rmse_held_out": 2.0 * rmse, "coverage90": 0.8,
-               "rmse_by_phase": {kind: rmse for kind in page.KINDS},
+               "rmse_by_phase": {kind: rmse for kind in PHASE_KINDS},
                "sampled": {"settled": False, "rhat": 1.25}}
         for when, rmse in (("before", 0.07), ("after", 0.0095))
     }  # fmt: skip

@@ -76,7 +76,7 @@ PARAMETERS = ALONE.surrogate.space.parameters
 
 @dataclasses.dataclass(frozen=True)
 class DrawnFit:
-    """What the figures need of an assessed fit."""
+    """An assessed fit with the values that the figures need."""
 
     force_n: np.ndarray
     band_n: tuple[np.ndarray, np.ndarray]

@@ -21,7 +21,7 @@ TESTS = ("full_model_finding", "surrogate_finding")
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the runs of the models."""
+    """Leaves out the runs of the models."""
     for name in TESTS:
         monkeypatch.setattr(doctor, name, lambda: doctor.Finding("model", True, "as stored"))
 

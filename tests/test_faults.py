@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -15,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ import pytest
 from toys import fuzzed_files
 from toys.closed_form_model import MOTION
 from toys.external_models import PARAMETERS, SPRING, TRUE, spring
+from toys.full_disk import files_at_most
 
 from bayeskin import storage
 from bayeskin.design_files import load_design
@@ -73,17 +73,6 @@ def refused(answer: tuple[int, str, str], says: str) -> None:
     assert says in err.splitlines()[-1]
 
 
-@contextmanager
-def files_at_most(size: int) -> Iterator[None]:
-    """Limits the size of files, so that writes fail as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("size", [0, 1000, 10_000])
 def test_a_full_disk_is_told_and_leaves_the_earlier_file(case: Path, size: int, bayeskin: Command) -> None:
     out = case.parent / "out.h5"
@@ -124,7 +113,7 @@ def told_of_a_full_disk(kind: str, folder: Path, room: AbstractContextManager[No
         make(Path(elsewhere) / kind)  # what is compiled on the way has files of its own
     path = folder / kind
     path.write_bytes(b"what was there before")
-    with room, pytest.raises(InputError, match=f"{kind}: found a file that cannot be written"):
+    with room, pytest.raises(InputError, match=f"^cannot write .*{kind}: "):
         make(path)
     assert path.read_bytes() == b"what was there before"
     assert [file.name for file in folder.iterdir()] == [kind]

@@ -85,7 +85,7 @@ CRYER = [(4, 0.03), pytest.param(6, 0.016, marks=pytest.mark.slow)]
 
 @pytest.mark.parametrize(("cells", "bound"), CRYER)
 def test_the_pressure_at_the_centre_of_cryers_sphere_rises_before_it_falls(cells, bound):
-    """To 3 % of the surface's pressure; half as much on bricks of two thirds the size."""
+    """The tolerance is 3 % of the surface's pressure; bricks of two thirds the size need half of it."""
     layer = elastic(nu=0.2, mobility=1e-9)
     mesh = octant(cells)
     space = taylor_hood(mesh)

@@ -1,4 +1,4 @@
-"""What the formulations of the test offer, and how a specification chooses between them."""
+"""The formulations of the test state what they offer, and a specification chooses between them."""
 
 from __future__ import annotations
 

@@ -75,6 +75,9 @@ def test_stuck_walkers_are_named() -> None:
     convergence = assess(chains, low, ("a", "b"), Limits())
     assert convergence.stuck == ((0, 7), (1, 4))
     assert "2 stuck walkers, ensemble 0 walker 7" in convergence.verdict.reasons[0]
+    low[0, :, 7] += 40.0
+    alone = assess(chains, low, ("a", "b"), Limits()).verdict
+    assert "1 stuck walker, ensemble 1 walker 4; none" in "".join(alone.reasons)
 
 
 def test_burn_in_leaves_the_start_behind() -> None:

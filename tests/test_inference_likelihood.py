@@ -249,7 +249,7 @@ def test_drawn_noise_has_the_chain_s_covariance() -> None:
 
 
 def test_a_block_is_scored_given_the_others() -> None:
-    """With Gaussian tails, the conditional normal of the block."""
+    """The score of Gaussian tails is the conditional normal density of the block."""
     problem = toy_problem()
     quiet = problem.binned
     problem.surrogate.predict = _without_diagonal(problem.surrogate.predict)

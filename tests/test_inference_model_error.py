@@ -51,7 +51,7 @@ def test_what_relaxes_is_the_answer_of_a_spring_and_a_dashpot() -> None:
 
 
 def test_it_is_a_normal_error_of_the_force_in_the_likelihood() -> None:
-    """With noise of Gaussian tails, a covariance that adds to the noise's and the surrogate's."""
+    """For noise of Gaussian tails, its covariance adds to those of the noise and the surrogate."""
     problem = toy_problem()
     error = ModelError(closed_form_model.MOTION, problem.binned.edges_s, 0.01)
     theta = np.array([[*TRUTH.values(), *NOISE.values()]])

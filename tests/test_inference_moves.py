@@ -35,7 +35,7 @@ def walled(shear: Shear | None) -> MoveCoordinates:
 
 
 def learnt(shear: Shear | None) -> Product:
-    """From draws of another distribution than the unit normal, so that tries are weighed."""
+    """Learns from draws of another distribution than the unit normal, so that tries are weighted."""
     rng = np.random.default_rng(3)
     draws = 0.3 + 1.2 * rng.standard_normal((3000, 5))
     return Product.of(walled(shear).forward(draws), (slice(0, 2), slice(2, 5)), rng)

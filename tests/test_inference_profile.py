@@ -69,7 +69,7 @@ def test_a_profile_is_nowhere_above_the_maximum_and_tops_what_holds_the_rest(
 
 
 def test_a_profile_begins_at_draws_too(best: Mapping[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without any climb: as high as the likeliest and the nearest draw about each value, moved onto it."""
+    """A profile without any climb is as high as the likeliest and the nearest draw about each value."""
     problem = toy_problem()
     rng = np.random.default_rng(4)
     about = problem.vector(best) + 0.02 * rng.standard_normal((40, problem.dim))

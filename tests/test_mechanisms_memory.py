@@ -93,7 +93,7 @@ def test_damage_follows_the_largest_energy_and_later_cycles_repeat():
 
 
 def test_the_tangent_knows_what_is_remembered(problem):
-    """From a state that has been stretched before: part of the points load on, part unload."""
+    """The state has been stretched before: some points load further, others unload."""
     everything = skin(problem, *SOLVED)
     start = everything.initial_state(0.0)
     before = everything.residual(unknowns(problem, 7), 0.7, start)

@@ -60,7 +60,7 @@ def test_a_ratio_of_no_stable_solid_is_refused(ratio):
     [(0.48, 0.3, 0.021, -0.0136), (0.3, 0.2, 0.058, -0.0413), (0.1, 0.1, 0.087, -0.0723)],
 )
 def test_a_compressible_skeleton_relaxes_in_the_hold_and_pushes_after_unloading(nu_c, nu_s, relaxed, after_n):
-    """On the 80 coarsest bricks, by how much of the peak; force at the end of the first unloading."""
+    """The 80 coarsest bricks give the shares of the peak, and the force at the end of the first unloading."""
     first = PadMotion(MOTION.time_s[:5], MOTION.displacement_m[:5])
     run = simulated(first, THETA | {"nu_c": nu_c, "nu_s": nu_s}, "skeleton-compressibility")
     peak, held, after = run.at(first.time_s[2:])

@@ -72,7 +72,7 @@ def test_the_chance_of_the_farthest_window_is_uniform_where_nothing_is_missing()
 
 @pytest.mark.parametrize("share", [1e-3, 1e-2])
 def test_what_the_model_is_wrong_by_is_no_mismatch(share: float) -> None:
-    """In each phase by another amount, of a sd that is allowed for, below the noise's and above."""
+    """The model errs by another amount in each phase, with an allowed sd below and above the noise's."""
     settings, chances = LocateSettings(mesh_error=share), []
     for seed in range(30):
         alone = concealing(seed)
@@ -181,7 +181,7 @@ def test_a_climb_never_ends_below_its_start_nor_outside_the_box() -> None:
 
 
 def test_a_quick_climb_goes_on_as_far_as_a_thorough_one() -> None:
-    """From noise that is much too large; the surrogate's error is not small."""
+    """The start has noise that is much too large, and the surrogate's error is not small."""
     problem = toy_problem()
     assert problem.predict(problem.from_sampling(np.mean(problem.bounds, axis=0))).factor[0].any()
     start = problem.vector({**TRUTH, **NOISE})
@@ -322,7 +322,7 @@ def test_what_a_posterior_rules_out_is_part_of_what_it_is() -> None:
 
 
 def test_the_most_probable_error_of_a_surrogate_that_knows_nothing_is_found() -> None:
-    """Beside columns that are alike and huge their prior is lost to rounding in a normal equation."""
+    """In a normal equation, columns that are alike and huge lose their prior to rounding."""
     rng = np.random.default_rng(0)
     residual, column = rng.standard_normal((2, 400))
     for size in (1.0, 1e12):

@@ -64,7 +64,7 @@ def drifting(at: Place) -> np.ndarray:
 
 
 def less_displaced(at: Place) -> np.ndarray:
-    """As if the pads had slipped between the cycles."""
+    """Returns a difference [N] that looks as if the pads had slipped between the cycles."""
     return -0.8 * at.displacement_m * (at.cycle == 2)
 
 

@@ -25,7 +25,7 @@ NEAR = "[tissue]\ncutis_mm = 2.3\nsubcutis_mm = 6\narm_radius_mm = 44\n"
 
 
 def test_a_reduced_run_is_near_the_full_one_and_says_how_near(bayeskin, tmp_path) -> None:
-    """On the demo's protocol, which no training run had."""
+    """The run has the demo's protocol, which no training run had."""
     set_ = ("--set", "E_c=80e3", "--set", "E_s=15e3")
     reduced, full = tmp_path / "reduced.csv", tmp_path / "full.csv"
     code, out, _ = bayeskin("simulate", "--reduced", *set_, "-o", reduced, "--json")

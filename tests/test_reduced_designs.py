@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
@@ -118,16 +118,17 @@ def test_the_full_model_runs_where_the_reduced_one_was_not_trained(
     ships: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waves = ReducedOrFull(ships, stand_in_model.ToyModel(ModelSpec()))
-    found = pickle.loads(pickle.dumps(waves))(MOTION, STIFF)
+    in_worker = ForkingPickler.loads(ForkingPickler.dumps(waves))
+    run = in_worker(MOTION, STIFF)
     right = stand_in_model.simulate(ModelSpec(), MOTION, STIFF)
-    np.testing.assert_array_equal(found.force_n, right.force_n)
-    assert (found.status, found.model_hash) == ("ok", waves.hash)
-    assert found.message == "run by the full model: E_c is 3e+06, outside the trained range 10000 to 2e+06"
+    np.testing.assert_array_equal(run.force_n, right.force_n)
+    assert (run.status, run.model_hash) == ("ok", waves.hash)
+    assert run.message == "run by the full model: E_c is 3e+06, outside the trained range 10000 to 2e+06"
     inside = replace(right, stats={"inside": 1.0}, force_n=2.0 * right.force_n)
     monkeypatch.setattr(design_model, "simulate_reduced", lambda *arguments, **more: inside)
-    found = waves(MOTION, TRUE)
-    np.testing.assert_array_equal(found.force_n, inside.force_n)
-    assert (found.model_hash, found.message) == (waves.hash, "")
+    reduced_run = waves(MOTION, TRUE)
+    np.testing.assert_array_equal(reduced_run.force_n, inside.force_n)
+    assert (reduced_run.model_hash, reduced_run.message) == (waves.hash, "")
 
 
 def test_the_hash_is_of_the_reduced_model_and_of_the_full_one(ships: Path, tmp_path: Path) -> None:

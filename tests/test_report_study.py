@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from toys import made_up_population as made_up
-from toys.browser import NAMES, Browser, found
+from toys.browser import Browser
 
 from bayeskin import report
 from bayeskin.report.page import StudyFacts, render_study
@@ -114,15 +114,6 @@ def test_a_study_without_a_population_says_why() -> None:
     assert "no population No population: one subject is left." in said
     assert "broken: no such file" in said
     assert "Variation" not in said
-
-
-@pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> Browser:
-    program = found()
-    if program is None:
-        pytest.skip(f"no browser: none of {', '.join(NAMES)} is on the PATH")
-    with Browser(program, tmp_path_factory.mktemp("profile")) as one:
-        yield one
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "light"), (1280, "dark")])

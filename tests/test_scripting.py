@@ -109,7 +109,7 @@ def test_the_full_model_weighs_the_documented_draws(said: dict[str, Any]) -> Non
 def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With numbers of NumPy among the settings."""
+    """The settings contain numbers of NumPy."""
     monkeypatch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     small = {

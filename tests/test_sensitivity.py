@@ -104,7 +104,7 @@ def test_indices_of_a_skin_like_force_agree_with_salib():
 
 @pytest.fixture(scope="module")
 def by_salib():
-    """What SALib says of the demo's force over the whole prior, by the bin of each phase."""
+    """The indices that SALib computes of the demo's force over the whole prior, by the bin of each phase."""
     pytest.importorskip("SALib", reason="SALib is not installed")
     from SALib.analyze import sobol as analyze
     from SALib.sample import sobol as sample

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import resource
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from toys import worker_functions
+from toys.full_disk import files_at_most
 
 from bayeskin.errors import InputError
 from bayeskin.execution.local import run_parallel
@@ -53,7 +51,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def kept(path: Path, heard: list[str] | None = None) -> list[bool]:
-    """Whether the store has the first and the second result, which are unchanged."""
+    """Returns whether the store has the first and the second result unchanged."""
     with Store(path, SHARED, (heard if heard is not None else []).append) as store:
         return [key in store and same(store.read(key, Result), result)
                 for key, result in (({"E_c": 1e5}, FIRST), ([2, "b"], SECOND))]  # fmt: skip
@@ -193,22 +191,14 @@ def test_several_processes_add_at_once(tmp_path: Path) -> None:
     assert len(path.read_bytes().splitlines()) == 1 + 3 * worker_functions.ADDED
 
 
-@contextmanager
-def files_at_most(size: int) -> Iterator[None]:
-    """Writes fail as on a full disk beyond a file's size."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("room", [0, 10, 200])
 def test_a_full_disk_is_told_and_costs_the_new_result_only(path: Path, room: int) -> None:
     before = path.read_bytes()
     with Store(path, SHARED) as store:
-        with files_at_most(len(before) + room), pytest.raises(InputError, match="cannot be written"):
+        with (
+            files_at_most(len(before) + room),
+            pytest.raises(InputError, match="cannot write"),
+        ):
             store.add("large", {"force_n": np.ones(1000)})
         assert "large" not in store
         assert path.read_bytes() == before
@@ -219,5 +209,5 @@ def test_a_full_disk_is_told_and_costs_the_new_result_only(path: Path, room: int
 def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for place in (tmp_path, tmp_path / "file" / "a.store"):
-        with pytest.raises(InputError, match="a file that cannot be written"):
+        with pytest.raises(InputError, match="cannot write"):
             kept(place)

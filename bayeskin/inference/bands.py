@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import (
-    KINDS,
     NoiseChain,
     NoisePriors,
     Windows,
@@ -21,7 +20,7 @@ from bayeskin.inference.noise_model import (
 )
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.surrogate_error import drawn_errors
-from bayeskin.types import POINTS_AT_ONCE, Array, BinnedForce, FreezesArrays, Prediction
+from bayeskin.types import PHASE_KINDS, POINTS_AT_ONCE, Array, BinnedForce, FreezesArrays, Prediction
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
@@ -135,7 +134,7 @@ def rmse(binned: BinnedForce, force_n: ArrayLike, windows: Windows | None = None
     usable = bins_in_windows(binned, None) >= 0
     kind = np.array([phase.kind for phase in binned.phases])[binned.phase]
     by_kind: dict[str, float] = {
-        k: _root_mean(square[usable & (kind == k)]) for k in KINDS if (kind == k).any()
+        k: _root_mean(square[usable & (kind == k)]) for k in PHASE_KINDS if (kind == k).any()
     }
     index = [bins_in_windows(binned, [window]) for window in windows or ()]
     return Rmse(_root_mean(square[usable]), by_kind, tuple(_root_mean(square[i == 0]) for i in index))

@@ -184,7 +184,7 @@ def _verdict(
         ),
         (
             not stuck,
-            f"{len(stuck)} stuck walkers"
+            f"{len(stuck)} stuck {'walker' if len(stuck) == 1 else 'walkers'}"
             + "".join(f", ensemble {e} walker {w}" for e, w in stuck[:3])
             + "; none is allowed",
         ),

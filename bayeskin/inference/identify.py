@@ -45,7 +45,7 @@ class IdentifiabilitySettings:
 
 
 class Informed(StrEnum):
-    """How well the data inform a parameter."""
+    """A grade of how well the data inform a parameter."""
 
     NOT = "not informed"
     WEAKLY = "weakly informed"

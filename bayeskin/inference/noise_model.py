@@ -30,16 +30,15 @@ from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.types import (
+    PHASE_KINDS,
     Array,
     BinnedForce,
     FreezesArrays,
     Parameter,
     ParameterSpace,
-    PhaseKind,
 )
 from bayeskin.types.joint import own_name, plain_name, recording_at, recording_of
 
-KINDS: tuple[PhaseKind, ...] = ("rest", "load", "hold", "unload")
 ALL = "noise"  # the kind of all phases where they share one sd
 Windows = Sequence[tuple[float, float]]
 _SOURCE = "weakly informative: spans what load cells and living skin show"
@@ -161,8 +160,8 @@ def noise_chain(
 
 
 def _ordered(kinds: set[str]) -> tuple[str, ...]:
-    """Returns names of kinds in the order of the recordings, then of `KINDS`."""
-    order = (*KINDS, ALL)
+    """Returns names of kinds in the order of the recordings, then of `PHASE_KINDS`."""
+    order = (*PHASE_KINDS, ALL)
     return tuple(sorted(kinds, key=lambda kind: (recording_of(kind), order.index(plain_name(kind)))))
 
 

@@ -1,4 +1,4 @@
-"""When ensembles wait for each other: to judge their convergence, and to fit proposals to their draws."""
+"""The times at which ensembles wait for each other, to judge convergence and to fit proposals to draws."""
 
 from __future__ import annotations
 

@@ -17,7 +17,6 @@ from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import fit, promised, restored
 from bayeskin.mismatch.hypotheses import Evidences
 from bayeskin.mismatch.refuted import refuted
-from bayeskin.mismatch.stiffness_ratio import STIFFEST_BELOW
 from bayeskin.mismatch.tasks import (
     EvidenceTask,
     FitTask,
@@ -29,7 +28,7 @@ from bayeskin.mismatch.tasks import (
     Task,
 )
 from bayeskin.mismatch.trust_region import SetFit, TrustSettings, as_json, fit_set, within
-from bayeskin.types import Array, PadMotion
+from bayeskin.types import STIFFEST_BELOW, Array, PadMotion
 
 TRUST = 0.15  # half width, as a share of the prior, of the region near a run in which its tangent is trusted
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayeskin.mismatch.unexplained import KIND_IN_WORDS, UNEXPLAINED, Place, Unexplained
-from bayeskin.types import Array
+from bayeskin.mismatch.unexplained import UNEXPLAINED, Place, Unexplained
+from bayeskin.types import PHASE_IN_WORDS, Array, PhaseKind
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ def describe(
     correlates with.
     """
     at, certain = remainder.at, np.abs(mean_n) > settings.certain * sd_n
-    sentences = [_in_phases(kind, at, mean_n, certain, settings) for kind in KIND_IN_WORDS]
+    sentences = [_in_phases(kind, at, mean_n, certain, settings) for kind in PHASE_IN_WORDS]
     sentences += [_over_cycles(at, mean_n, certain, settings), *_correlations(remainder, mean_n, settings)]
     return tuple(sentence for sentence in sentences if sentence)
 
 
 def _in_phases(
-    kind: str, at: Place, mean_n: Array, certain: NDArray[np.bool_], settings: FeatureSettings
+    kind: PhaseKind, at: Place, mean_n: Array, certain: NDArray[np.bool_], settings: FeatureSettings
 ) -> str:
     """Returns the size and sign of a discrepancy in one kind of phase, if enough of its bins are certain."""
     inside = at.kind == kind
@@ -52,11 +52,10 @@ def _in_phases(
         return ""
     level, size = float(np.mean(mean_n[inside])), float(np.sqrt(np.mean(mean_n[inside] ** 2)))
     if abs(level) < settings.one_sided * size:
-        return f"{KIND_IN_WORDS[kind]} the difference changes its sign and is {1e3 * size:.1f} mN RMS"
+        return f"{PHASE_IN_WORDS[kind]} the difference changes its sign and is {1e3 * size:.1f} mN RMS"
     side = "above" if level > 0 else "below"
-    return (
-        f"{KIND_IN_WORDS[kind]} the recorded force is {1e3 * abs(level):.1f} mN {side} the model's on average"
-    )
+    mean_mn = f"{1e3 * abs(level):.1f} mN"
+    return f"{PHASE_IN_WORDS[kind]} the recorded force is {mean_mn} {side} the model's on average"
 
 
 def _over_cycles(at: Place, mean_n: Array, certain: NDArray[np.bool_], settings: FeatureSettings) -> str:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayeskin.types import Array, ParameterSpace
-
-# Largest modulus of the subcutis over that of the cutis: a cutis folds on a stiffer one, and fat is softer.
-STIFFEST_BELOW = 2.0
+from bayeskin.types import STIFFEST_BELOW, Array, ParameterSpace
 
 
 def subcutis_too_stiff(space: ParameterSpace, theta: Array) -> NDArray[np.bool_]:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.mismatch.unexplained import KIND_IN_WORDS, Place, Unexplained, place
-from bayeskin.types import Array, PadMotion, Phase
+from bayeskin.mismatch.unexplained import Place, Unexplained, place
+from bayeskin.types import PHASE_IN_WORDS, Array, PadMotion, Phase, PhaseKind
 from bayeskin.types.joint import recording_at
 
 
@@ -93,7 +93,7 @@ def _functions(
     yield "time", "s", at.time_s
     yield "cycles done", "1", cycles_done
     for kind in ("hold", "rest", "load", "unload"):
-        yield f"a constant {KIND_IN_WORDS[kind]}", "1", (at.kind == kind).astype(float)
+        yield f"a constant {PHASE_IN_WORDS[kind]}", "1", (at.kind == kind).astype(float)
     yield "speed", "m/s", at.speed_m_s
     yield "the model's force", "N", force_n * np.ones_like(u)
     yield "displacement squared", "m^2", u**2
@@ -108,14 +108,15 @@ def _functions(
     yield "the model's force times time", "N s", force_n * at.time_s
     for tau_s in settings.taus_s:
         yield f"memory of displacement over {tau_s:g} s", "m", memory(motion, at.time_s, tau_s)
-    for kind in ("hold", "rest"):
+    still: tuple[PhaseKind, ...] = ("hold", "rest")
+    for kind in still:
         inside = (at.kind == kind) & (at.cycle > 0)
         for tau_s in settings.taus_s:
-            name = f"1 − exp(−t / {tau_s:g} s) {KIND_IN_WORDS[kind]}"
+            name = f"1 − exp(−t / {tau_s:g} s) {PHASE_IN_WORDS[kind]}"
             yield name, "1", inside * -np.expm1(-at.since_s / tau_s)
         for tau_s in settings.log_taus_s:
             yield (
-                f"log(1 + t / {tau_s:g} s) {KIND_IN_WORDS[kind]}",
+                f"log(1 + t / {tau_s:g} s) {PHASE_IN_WORDS[kind]}",
                 "1",
                 inside * np.log1p(at.since_s / tau_s),
             )

@@ -31,7 +31,6 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, PadMotion, Phase
 
 DIRECTION = {"rest": 0.0, "load": 1.0, "hold": 0.0, "unload": -1.0}
-KIND_IN_WORDS = {"rest": "at rest", "load": "while loading", "hold": "in holds", "unload": "while unloading"}
 
 
 @dataclass(frozen=True)

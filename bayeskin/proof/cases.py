@@ -23,9 +23,7 @@ from bayeskin.proof.plans import SIZES, Plan
 from bayeskin.proof.protocol import EDGES_S
 from bayeskin.proof.refit_residual import ALONE, rms
 from bayeskin.proof.screen import Screen
-from bayeskin.types import Array, ParameterSpace
-
-STIFFEST_BELOW = 2.0  # upper bound of E_s / E_c
+from bayeskin.types import STIFFEST_BELOW, Array, ParameterSpace
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class StatedUnit:
 
 @dataclass(frozen=True)
 class Stated:
-    """What the user states about a file; everything else is taken from the file.
+    """The statements of the user about a file; everything else is taken from the file.
 
     columns : the name of the column of a quantity, or its number from 1
     units : the unit of a quantity

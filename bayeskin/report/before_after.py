@@ -32,13 +32,11 @@ from bayeskin.report.style import (
     styled,
 )
 from bayeskin.report.timeline import shade_phases
-from bayeskin.types import Array, BinnedForce, PadMotion, Parameter, Phase, PhaseKind
+from bayeskin.types import PHASE_IN_WORDS, Array, BinnedForce, PadMotion, Parameter, Phase, PhaseKind
 
 Summaries = Mapping[str, Mapping[str, Any]]  # "mean" and "interval90" of each parameter, by its name
 BAND = "#B9D6EA"  # bands around lines in the colour MODEL
-WORDS: dict[PhaseKind, str] = {
-    "load": "while loading", "unload": "while unloading", "hold": "in holds", "rest": "at rest",
-}  # fmt: skip
+PANELS: tuple[PhaseKind, ...] = ("load", "unload", "hold", "rest")
 
 
 class _DrawnFit(Protocol):
@@ -188,7 +186,7 @@ def figure_residual_by_phase(
 
     Each cycle has its own line.
     """
-    kinds = [kind for kind in WORDS if any(phase.kind == kind for phase in binned.phases)]
+    kinds = [kind for kind in PANELS if any(phase.kind == kind for phase in binned.phases)]
     rows = (len(kinds) + 1) // 2
     figure = new_figure(PAGE_IN, 0.7 + 1.9 * rows)
     panels = list(figure.subplots(rows, 2, squeeze=False).flat)
@@ -197,7 +195,7 @@ def figure_residual_by_phase(
     sizes = {}
     for ax, kind, letter in zip(panels, kinds, "abcd", strict=False):
         sizes[kind] = [_draw_kind(ax, kind, binned, motion, fit, fit is after) for fit in (before, after)]
-        panel_title(ax, letter, "{}: {:.1f} → {:.1f} mN RMS".format(WORDS[kind], *sizes[kind]))
+        panel_title(ax, letter, "{}: {:.1f} → {:.1f} mN RMS".format(PHASE_IN_WORDS[kind], *sizes[kind]))
     handles = [Line2D([], [], color=GREY, label="before"), Line2D([], [], color=MODEL, label="after")]
     panels[0].margins(y=0.22)  # leaves space for the legend
     panels[0].legend(handles=[*handles, Patch(color=FAINT, label="allowed, 90 %")], loc="upper left", ncols=3)
@@ -206,7 +204,9 @@ def figure_residual_by_phase(
     most = max(sizes, key=lambda kind: sizes[kind][1])
     state_finding(
         figure,
-        "Largest residual {}: {:.1f} mN RMS before, {:.1f} mN after".format(WORDS[most], *sizes[most]),
+        "Largest residual {}: {:.1f} mN RMS before, {:.1f} mN after".format(
+            PHASE_IN_WORDS[most], *sizes[most]
+        ),
         "Before: best fit of the base model. After: best fit with the best set of mechanisms. Later cycles "
         "are fainter. Allowed (after): measured noise, the model's own error and the uncertainty of the "
         "parameters.",

@@ -1,4 +1,4 @@
-"""What a study says about a population, and what its data cannot tell, as values without sentences."""
+"""The results of a study about a population, and what its data cannot tell, as values without sentences."""
 
 from __future__ import annotations
 

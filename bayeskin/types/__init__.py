@@ -8,15 +8,18 @@ name each dataclass of this package, so a dataclass keeps its name.
 from bayeskin.types.arrays import Array, FreezesArrays, frozen_array
 from bayeskin.types.design import Design
 from bayeskin.types.joint import Span
-from bayeskin.types.parameters import Correlation, Parameter, ParameterSpace
-from bayeskin.types.protocol import PadMotion, Phase, PhaseKind
+from bayeskin.types.parameters import STIFFEST_BELOW, Correlation, Parameter, ParameterSpace
+from bayeskin.types.protocol import PHASE_IN_WORDS, PHASE_KINDS, PadMotion, Phase, PhaseKind
 from bayeskin.types.provenance import Provenance
 from bayeskin.types.recording import BinnedForce, Jumps, Recording
 from bayeskin.types.simulation import Observation, Simulation
 from bayeskin.types.surrogate import POINTS_AT_ONCE, Prediction, Surrogate
 
 __all__ = [
+    "PHASE_IN_WORDS",
+    "PHASE_KINDS",
     "POINTS_AT_ONCE",
+    "STIFFEST_BELOW",
     "Array",
     "BinnedForce",
     "Correlation",

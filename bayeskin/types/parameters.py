@@ -13,6 +13,9 @@ from scipy.special import ndtr, ndtri
 from bayeskin.errors import InputError
 from bayeskin.types.arrays import Array, frozen_array
 
+# Largest modulus of the subcutis over that of the cutis: a cutis folds on a stiffer one, and fat is softer.
+STIFFEST_BELOW = 2.0
+
 
 @dataclass(frozen=True)
 class Parameter:

@@ -12,6 +12,10 @@ from bayeskin.types.arrays import Array, FreezesArrays
 from bayeskin.types.joint import Span
 
 PhaseKind = Literal["rest", "load", "hold", "unload"]
+PHASE_IN_WORDS: dict[PhaseKind, str] = {
+    "rest": "at rest", "load": "while loading", "hold": "in holds", "unload": "while unloading",
+}  # fmt: skip
+PHASE_KINDS = tuple(PHASE_IN_WORDS)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a worker returns: a text, which is the reason where it failed."""
+    """The answer of a worker: whether it succeeded, and a text, which gives the reason if it failed."""
 
     ok: bool
     text: str = ""

@@ -12,13 +12,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import pytest
+
 NAMES = ("chromium", "chromium-browser", "chromium-headless-shell", "google-chrome", "chrome")
 PATIENCE_S = 60.0
 
 
-def found() -> str | None:
-    """Returns the path of a browser that the PATH has."""
-    return next(filter(None, map(shutil.which, NAMES)), None)
+def opened_browser(profile: Path) -> Browser:
+    """Starts the browser that the PATH has; skips the test if there is none."""
+    program = next(filter(None, map(shutil.which, NAMES)), None)
+    if program is None:
+        pytest.skip(f"no browser: none of {', '.join(NAMES)} is on the PATH")
+    return Browser(program, profile)
 
 
 class Browser:

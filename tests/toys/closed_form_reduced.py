@@ -166,7 +166,7 @@ def bench(
 
 
 def a_run(bench: DiagnosisContext, names: Sequence[str] = (), **values: float) -> ModelRun:
-    """With derivatives, at the truth but for these values."""
+    """Returns a run with derivatives, at the truth except for these values."""
     neutral = {name: value for mechanism in names for name, value in KNOWN[mechanism].neutral.items()}
     run = bench.run(names, {**neutral, **TRUTH, **values})
     assert isinstance(run, ModelRun)

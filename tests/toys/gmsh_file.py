@@ -13,7 +13,7 @@ NUMBER = {name: n for n, name in enumerate((*GMSH_NAMES, *GMSH_LAYERS, "everythi
 
 
 def coarse_tetrahedra(geometry: Geometry = Geometry()) -> SkinMesh:
-    """As few tetrahedra as show the edges of pads, guard and layers."""
+    """Returns a mesh with the fewest tetrahedra that show the edges of pads, guard and layers."""
     length, width, thickness = geometry.box_m
     lines = (0.0, *geometry.along_m, length), (0.0, *geometry.across_m, width)
     depths = (0.0, geometry.subcutis_m, thickness)

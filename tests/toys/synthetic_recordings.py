@@ -59,7 +59,7 @@ def coloured(rng: np.random.Generator, size: int, white_n: float, slow_n: float,
 
 
 def recording(force_n: np.ndarray, motion: PadMotion = MOTION, time_s: np.ndarray = TIME_S) -> Recording:
-    """As an instrument writes it: displacement to 0.01 mm, force to 1 mN."""
+    """Returns what an instrument writes: displacement to 0.01 mm, force to 1 mN."""
     return Recording(time_s, quantised(motion.at(time_s), 1e-5), quantised(force_n, 1e-3), "made", "")
 
 
