@@ -28,8 +28,10 @@ class CannotWrite(InputError):
     """A file cannot be written, for example because the disk is full or the permission is missing."""
 
     def __init__(self, path: object, error: OSError) -> None:
-        super().__init__(path, f"a file that cannot be written ({error.strerror})", "a file to write to")
-        self.args = (f"cannot write {self.where}: {error.strerror}",)
+        super().__init__(path, error.strerror, "free space and write permission")
+
+    def __str__(self) -> str:
+        return f"cannot write {self.where}: {self.found}"
 
 
 class Unavailable(InputError):
