@@ -1,4 +1,4 @@
-"""Exports the posterior of a run for other programs: a table of draws, a fitted normal, or FEBio materials."""
+"""Exports the posterior of a run: as a table of draws, a fitted normal distribution, or FEBio materials."""
 
 from __future__ import annotations
 
