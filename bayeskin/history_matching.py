@@ -57,7 +57,7 @@ def misfit_bounds(mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike
     weight = np.asarray(weights, dtype=float)
     used = weight > 0
     if not used.any():
-        raise InputError("weights of the bins", "no bin with a weight above zero", "at least one fitted bin")
+        raise InputError("weights of the bins", "no weight is above zero", "at least one bin must be fitted")
     share = weight[used] / weight[used].sum()
     misfit = np.sqrt((np.asarray(force_n)[used] - mean[:, used]) ** 2 @ share)
     spread = np.sqrt(sd[:, used] ** 2 @ share)

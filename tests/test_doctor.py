@@ -27,7 +27,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def broken(said: dict[str, Any]) -> dict[str, str]:
-    return {finding["name"]: finding["found"] for finding in said["findings"] if not finding["ok"]}
+    return {finding["name"]: finding["state"] for finding in said["findings"] if not finding["ok"]}
 
 
 def test_the_models_give_the_stored_numbers_here(
@@ -55,7 +55,7 @@ def test_a_model_that_gives_another_number_is_broken(
     monkeypatch.setattr(doctor, number, 1.01 * getattr(doctor, number))
     finding = {"full model": doctor.full_model_finding, "surrogate": doctor.surrogate_finding}[name]()
     assert (finding.name, finding.ok) == (name, False)
-    assert "within" in finding.advice
+    assert "within" in finding.needed
 
 
 @pytest.mark.usefixtures("quick")

@@ -74,6 +74,8 @@ def new(recordings: tuple[Path, ...], out: Path | None, device: Path | None) -> 
         return new_config(recordings, out, device)
     if device is not None:
         raise InputError(
-            f"--device {device}", "no recording", "a recording, because the demo uses the article's device"
+            f"--device {device}",
+            "no recording is given",
+            "give one, because the demo uses the article's device, or leave out --device",
         )
     return new_demo(out)

@@ -154,13 +154,13 @@ def stated_geometry(device: DeviceConfig, tissue: TissueConfig, where: object) -
             arm_radius_m=None if radius == "flat" else _metres(radius),
         )
     except InputError as error:
-        raise InputError(f"{where}: {_KEYS[error.where]}", error.found, error.expected) from None
+        raise InputError(f"{where}: {_KEYS[error.where]}", error.problem, error.remedy) from None
     sd_m = {}
     for name, value in tissue:
         if isinstance(value, Uncertain):
             if value.sd > LARGEST_SD * value.mean:
-                found = f"sd {value.sd:g} of a mean of {value.mean:g} mm"
-                raise InputError(f"{where}: tissue.{name}", found, "an sd of at most a third of the mean")
+                problem = f"an sd of {value.sd:g} mm is too large for a mean of {value.mean:g} mm"
+                raise InputError(f"{where}: tissue.{name}", problem, "it must be at most a third of the mean")
             sd_m[name.removesuffix("m")] = _metres(value.sd)
     return StatedGeometry(geometry, sd_m)
 

@@ -40,8 +40,8 @@ def derivative_errors(bind: Bind, values: Mapping[str, float], seed: int = 0) ->
     after = _response(law, solid, _states(rng), before)[1]
     unfilled = int(np.isnan(after).any(axis=0).sum())
     if law.respond is not None and unfilled:
-        found = f"{unfilled} of {law.remembers} numbers of the memory without a value"
-        raise InputError("respond", found, "all of `after`, at all points")
+        problem = f"it leaves {unfilled} of {law.remembers} numbers of the memory without a value"
+        raise InputError("respond", problem, "it must fill all of `after`, at all points")
     before[::2] = after[::2]
     state, none = _states(rng), TissueLaw()
     base = _derivatives(none, solid, state, before)

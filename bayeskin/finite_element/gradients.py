@@ -84,7 +84,9 @@ class ForceGradients:
     ) -> None:  # fmt: skip
         unknown = [name for name in changes if name not in theta]
         if unknown:
-            raise InputError("gradients", unknown[0], f"one of {', '.join(theta)}")
+            raise InputError(
+                "gradients", f"{unknown[0]} is not a parameter of the run", f"use some of {', '.join(theta)}"
+            )
         self.names = tuple(changes)
         self._model, self._follows = model, _scaling_rule(model, theta, changes)
         self._solved = tuple(name for name in changes if not (self._follows and name == "E_c"))

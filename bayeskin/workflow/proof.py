@@ -18,7 +18,7 @@ from typing import Any
 
 import bayeskin
 from bayeskin import proof, report
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 from bayeskin.hashing import sha256_of_file
 from bayeskin.json_files import plain
 from bayeskin.proof import seals
@@ -65,7 +65,7 @@ def prove(
     folder = shipped(SET).parent if folder is None else folder
     index, sources = seals.read_index(folder), diagnosing_sources()
     if not index:
-        raise InputError(folder, "a set without recordings", "a set that `bayeskin conceal` made")
+        raise InputError(folder, "the set has no recordings", "use a set that `bayeskin conceal` made")
     hashes = {number: entry["recording_sha256"] for number, entry in index.items()}
     diagnosed_again = _Diagnoser(folder, hashes, reporter, diagnose).work(sources, at_most, rediagnose)
     verdicts = {
@@ -136,7 +136,11 @@ class _Diagnoser:
         """
         source, expected = seals.recording_path(self.folder, number), self.hashes[number]
         if sha256_of_file(source) != expected:
-            raise InputError(source, "other contents than the index states", f"sha256 {expected[:12]}...")
+            raise InputError(
+                source,
+                "its contents differ from those of the index",
+                f"its sha256 must be {expected[:12]}...",
+            )
         with tempfile.TemporaryDirectory(prefix="bayeskin-prove-", ignore_cleanup_errors=True) as place:
             copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
             try:
@@ -169,7 +173,7 @@ def _record_and_draw(
     except InputError as error:
         reporter.log(f"{error}: figure and scoring are not stored")
     except OSError as error:  # a set inside an installed package may be read-only
-        reporter.log(f"{folder}: {error.strerror}: figure and scoring are not stored")
+        reporter.log(f"{folder}: figure and scoring are not stored ({reason_of(error)})")
     return ()
 
 
@@ -181,7 +185,11 @@ def conceal(
     Raises InputError as `proof.conceal`, and where another process works on the set.
     """
     if count < 1 or seed < 0:
-        raise InputError("--seed, --count", f"{seed}, {count}", "a seed of at least 0, a count of at least 1")
+        raise InputError(
+            "--seed, --count",
+            f"they are {seed} and {count}",
+            "the seed must be at least 0, and the count at least 1",
+        )
     started = time.monotonic()
 
     with locked(folder):
