@@ -83,7 +83,7 @@ def with_interval(value: float, low: float, high: float, unit: str = "", digits:
     factor, name = scale([value, low, high], unit)
     power = math.floor(math.log10(abs(factor * value))) if value else 0
     power = 0 if _SMALLEST <= power < _LONGEST else power
-    middle, *ends = (number(factor * one / 10.0**power, digits) for one in (value, low, high))
+    middle, *ends = (number(factor * bound / 10.0**power, digits) for bound in (value, low, high))
     times = f"× 10{str(power).translate(_RAISED)}" if power else ""
     return " ".join(part for part in (f"{middle} [{ends[0]}, {ends[1]}]", times, name) if part)
 

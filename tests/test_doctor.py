@@ -70,7 +70,7 @@ def test_a_package_that_is_absent_or_too_old_is_named(
     shown = capsys.readouterr().out
     assert end.value.code == 1
     assert "BROKEN  numpy" in shown
-    assert "expected >=99" in shown
+    assert "needed: >=99" in shown
     assert "BROKEN  no-such-package: not installed" in shown
     assert "ok      scipy" in shown
     assert "no-such-wheel" not in shown  # needed elsewhere only

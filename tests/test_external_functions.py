@@ -125,17 +125,17 @@ def test_a_function_is_asked_for_no_time_twice() -> None:
         ("absent.py:force", PARAMETERS, "absent.py"),
         ("spring.py:absent", PARAMETERS, "no function absent"),
         ("spring.py:number", PARAMETERS, "no function number"),
-        ("spring.py", PARAMETERS, "expected FILE.py:FUNCTION"),
-        ("nowhere.at.all:force", PARAMETERS, "expected a Python file or module"),
+        ("spring.py", PARAMETERS, "write FILE.py:FUNCTION"),
+        ("nowhere.at.all:force", PARAMETERS, "name a Python file or module"),
         ("broken.py:force", PARAMETERS, "SyntaxError"),
         ("spring.py:raising", PARAMETERS, "ZeroDivisionError: division by zero (spring.py, line "),
-        ("spring.py:short", PARAMETERS, "a force of shape (3,); expected shape (1"),
+        ("spring.py:short", PARAMETERS, "its forces is (3,); it must be (1"),
         ("spring.py:endless", PARAMETERS, "not finite"),
         ("spring.py:force", "", "KeyError: 'stiffness'"),
-        ("spring.py:force", "[parameters.stiffness]\nlower = 1.0\n", "stiffness.upper: found nothing"),
+        ("spring.py:force", "[parameters.stiffness]\nlower = 1.0\n", "stiffness.upper: there is no value"),
         ("spring.py:force", PARAMETERS + '[surrogate]\nfile = "demo.h5"\n', "a surrogate of another model"),
-        ("ftp://here", PARAMETERS, "expected http://HOST:PORT"),
-        ("http://here:port", PARAMETERS, "expected http://HOST:PORT"),
+        ("ftp://here", PARAMETERS, "http://HOST:PORT"),
+        ("http://here:port", PARAMETERS, "http://HOST:PORT"),
         ("http://127.0.0.1:9", PARAMETERS, "no answer"),
     ],
 )
@@ -153,7 +153,7 @@ def test_own_and_full_models_are_not_mixed(case: Path, capsys: pytest.CaptureFix
         assert "no fields, figures or mechanisms" in refused(capsys, "simulate", case, *option, "-o", out)
     assert "a model of your own" in refused(capsys, "simulate", case, "--mesh", "bricks", "-o", out)
     case.write_text(case.read_text().replace('forward = "spring.py:force"', 'observation = "own"'))
-    assert "expected 'own' with model.forward" in refused(capsys, "simulate", case, "-o", out)
+    assert "it must be 'own' with model.forward" in refused(capsys, "simulate", case, "-o", out)
 
 
 def test_simulate_runs_it(case: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -172,5 +172,5 @@ def test_pre_stretch_opens_the_pads_by_a_share_of_this_gauge():
 @pytest.mark.parametrize("observation", ["article", "own"])
 def test_observations_that_know_one_device_refuse_another(observation):
     options = {"mesh": "some.msh"} if observation == "article" else {"forward": "http://localhost:1"}
-    with pytest.raises(InputError, match="geometry: found settings other than the article's"):
+    with pytest.raises(InputError, match="geometry: it is not the article's"):
         ModelSpec(observation=observation, geometry=PADS, **options)

@@ -230,7 +230,7 @@ def test_another_shape_seed_or_file_is_refused(chains: Path, tmp_path: Path) -> 
     with pytest.raises(InputError, match="a chain of a, b"):
         sample(toy, chains, 7, {**TRUTH, **NOISE}, dataclasses.replace(SHORT, walkers=24))
     (chains / "ensemble_0.h5").write_bytes(b"half a file")
-    with pytest.raises(InputError, match="not readable as HDF5"):
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
         sample(problem, chains, 7, LINE_START, SHORT)
     with pytest.raises(InputError, match="at least 12"):
         sample(problem, tmp_path / "new", 7, LINE_START, dataclasses.replace(SHORT, walkers=8))

@@ -336,15 +336,15 @@ def test_another_package_adds_a_mechanism(plugin):
 
 def test_a_need_of_what_there_is_not_is_refused(plugin):
     plugin("magnet", "pull", "needs=('iron',),")
-    with pytest.raises(InputError, match="magnet: found a need of iron"):
+    with pytest.raises(InputError, match="magnet: it needs iron"):
         catalogue()
 
 
 @pytest.mark.parametrize(
     ("name", "parameter", "message"),
     [
-        ("force-offset", "pull", "found force-offset twice"),
-        ("magnet", "F0", "found a parameter F0 in force-offset and magnet"),
+        ("force-offset", "pull", "the name force-offset"),
+        ("magnet", "F0", "force-offset and magnet have a parameter F0"),
     ],
 )
 def test_two_of_one_name_are_refused(plugin, name, parameter, message):
@@ -361,11 +361,14 @@ def test_a_parameter_without_a_neutral_value_gets_the_median_of_its_prior(plugin
 @pytest.mark.parametrize(
     ("made", "message"),
     [
-        ({"neutral": "pul"}, "magnet: found a neutral value of pul; expected of at least one .* pull, rust"),
-        ({"lower": 0.0}, "magnet: rust: found log-uniform from 0 to 1; expected a lower bound"),
-        ({"lower": 2.0}, "magnet: rust: found log-uniform from 2 to 1; expected a lower bound"),
-        ({"more": "coil=3"}, "entry point magnet = magnet:MECHANISM: found TypeError.*import magnet"),
-        ({"more": "); MECHANISM = dict("}, "magnet:MECHANISM: found an object of the type dict"),
+        ({"neutral": "pul"}, "magnet: `neutral` names pul; it must name at least one .* pull, rust"),
+        ({"lower": 0.0}, "magnet: rust: its prior is log-uniform from 0 to 1; the lower bound"),
+        ({"lower": 2.0}, "magnet: rust: its prior is log-uniform from 2 to 1; the lower bound"),
+        (
+            {"more": "coil=3"},
+            r"entry point magnet = magnet:MECHANISM: it cannot be imported \(TypeError.*import magnet",
+        ),
+        ({"more": "); MECHANISM = dict("}, "magnet:MECHANISM: it is an object of the type dict"),
     ],
 )
 def test_a_mechanism_of_another_package_that_cannot_work_is_refused_in_one_line(plugin, made, message):

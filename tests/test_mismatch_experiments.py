@@ -313,7 +313,7 @@ class Asked:
 
 @pytest.fixture
 def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
-    """A run whose diagnosis has been made, and found that something rubs."""
+    """A run whose diagnosis is complete, with the verdict that something rubs."""
     (tmp_path / "x.toml").write_text('[recording]\nfile = "x.h5"\n')
     record = Record("inputs", True, 1.0, {"diagnosis.json": "00"})
     (tmp_path / "x" / "diagnose").mkdir(parents=True)
@@ -353,7 +353,7 @@ def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(experiment, "searched", lambda *_: made([]))
-    with pytest.raises(InputError, match="no fit of rub; expected the fits that `bayeskin diagnose` stores"):
+    with pytest.raises(InputError, match="no fit of rub; remove the run's folder `diagnose`"):
         experiment.choose([diagnosed.source], Silent())
     failed = {"ok": False, "message": "too few runs", "text": "design: failed: too few runs"}
     monkeypatch.setattr(diagnosis, "diagnose", lambda *_: failed)

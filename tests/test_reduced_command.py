@@ -93,8 +93,8 @@ def test_one_beside_the_source_goes_before_the_shipped_one(tmp_path) -> None:
     [
         ("[device]\ngauge_mm = 0.036\n", (), "0.036 mm"),
         ("[device]\nguard_mm = { gap = -1, width = 8 }\n", (), "inside the pad"),
-        ("[device]\nlength = 3\n", (), "unknown key"),
-        (NEAR, ("-o", "model.csv"), "ending .h5"),
+        ("[device]\nlength = 3\n", (), "this key is not known"),
+        (NEAR, ("-o", "model.csv"), "use .h5"),
         (None, (), "no such file"),
     ],
 )

@@ -312,7 +312,7 @@ def test_priors_without_a_skin_that_can_be_are_refused(monkeypatch: pytest.Monke
     soft, stiff = (replace(p, lower=low, upper=high) for p, low, high in
                    zip(BASE.parameters[:2], (10e3, 200e3), (20e3, 400e3), strict=True))  # fmt: skip
     base = ParameterSpace((soft, stiff, *BASE.parameters[2:]))
-    with pytest.raises(InputError, match="priors: found no tissue for which the model runs"):
+    with pytest.raises(InputError, match="priors: the model runs for no tissue"):
         Asked(closed_form_reduced.bench(monkeypatch, closed_form_reduced.recorded(0), base)).search()
 
 

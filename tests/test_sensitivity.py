@@ -143,7 +143,7 @@ def test_one_parameter_has_all_the_variance(estimate):
 
 
 def test_samples_that_carry_nothing_but_a_constant_are_refused():
-    with pytest.raises(InputError, match=r"sobol\.samples: found 8; expected at least 20 with 4 parameters"):
+    with pytest.raises(InputError, match=r"sobol\.samples: 8 .* at least 20 with 4 parameters"):
         projection(sobol_g, box(4, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 8)
 
 

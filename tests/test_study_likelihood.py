@@ -154,7 +154,9 @@ def test_recordings_with_other_parameters_are_refused() -> None:
     fewer = ParameterSpace(LOG_UNIFORM.parameters[:1])
     recordings = [Individual(name, space, space.draw(rng, 200)) for name, space in
                   (("arm-1", LOG_UNIFORM), ("arm-2", fewer))]  # fmt: skip
-    with pytest.raises(InputError, match=r"arm-2: found parameters E_c; expected E_c, k_s, as in arm-1"):
+    with pytest.raises(
+        InputError, match=r"arm-2: its parameters are E_c; they must be E_c, k_s, as in arm-1"
+    ):
         Likelihoods.of(recordings, rng)
 
 

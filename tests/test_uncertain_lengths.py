@@ -140,5 +140,5 @@ def test_lengths_among_the_parameters_move_the_nodes() -> None:
 
 
 def test_lengths_that_cannot_be_are_refused() -> None:
-    with pytest.raises(InputError, match="cutis_m: found 20 mm; expected"):
+    with pytest.raises(InputError, match="cutis_m: it is 20 mm; it must be"):
         simulate(SPEC, MOTION, THETA | {"cutis_m": 20e-3})

@@ -75,8 +75,12 @@ def _input_error(path: Path | str, complaint: ValidationError, root: type[Sectio
     remedy = f"it must {rule}" if should else rule[:1].lower() + rule[1:]
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         remedy = "it must be a table"
+    elif kind in ("list_type", "tuple_type"):
+        remedy = "it must be a list"
     elif kind == "too_long":
         remedy = f"it must have at most {first['ctx']['max_length']} entries"
+    elif kind == "too_short":
+        remedy = f"it must have at least {first['ctx']['min_length']} entries"
     given_text = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
     return InputError(f"{path}: {key}", f"{given_text} is not allowed", remedy)
 

@@ -47,11 +47,11 @@ def catalogue() -> dict[str, Mechanism]:
 def _catalogue_on(_: tuple[str, ...]) -> dict[str, Mechanism]:
     """Returns the catalogue with the packages that are installed on a search path."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
-    found = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
-    found += [_checked(_loaded(entry)) for entry in entry_points(group=ENTRY_POINTS)]
-    _check_names(found)
-    known = {m.name: m for m in sorted(found, key=lambda m: m.name)}
-    for mechanism in found:
+    mechanisms = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
+    mechanisms += [_checked(_loaded(entry)) for entry in entry_points(group=ENTRY_POINTS)]
+    _check_names(mechanisms)
+    known = {m.name: m for m in sorted(mechanisms, key=lambda m: m.name)}
+    for mechanism in mechanisms:
         for name in mechanism.needs:
             if name not in known or known[name].needs:
                 raise InputError(

@@ -57,7 +57,7 @@ class Concealed:
     key: Mapping[str, Any]
 
 
-Made = Concealed | tuple[str, str, str]  # or the texts of an InputError: where, found, expected
+Outcome = Concealed | tuple[str, str, str]  # or the texts of an InputError: where, problem, remedy
 
 
 @lru_cache(maxsize=3)
@@ -83,7 +83,7 @@ def full_run(case: Case, names: Sequence[str], change: Change) -> Simulation:
     return simulate_on(problem, solid, TOLERANCE, change.moved(MOTION), {**case.theta, **values}, binds)
 
 
-def made_of(plan: Plan) -> Made:
+def concealed_or_error(plan: Plan) -> Outcome:
     """Returns `concealed` by the full model and the shipped surrogates, or the texts of an InputError.
 
     A worker process calls this function.
@@ -100,7 +100,7 @@ def conceal(
     count: int,
     only: Sequence[str] = (),
     tell: Callable[[float, str], None] = lambda share, note: None,
-    make: Callable[[Plan], Made] = made_of,
+    make: Callable[[Plan], Outcome] = concealed_or_error,
     run_all: Map = TWO_AT_ONCE,
 ) -> int:
     """Makes the missing recordings of a set of `count`, and returns how many it made.

@@ -146,4 +146,4 @@ class Population:
     @property
     def trusted(self) -> bool:
         """Returns whether the draws have converged, and no weighted draws contradict them."""
-        return self.convergence.verdict.trusted and not any(one.contradicts for one in self.overlaps)
+        return self.convergence.verdict.trusted and not any(overlap.contradicts for overlap in self.overlaps)

@@ -191,10 +191,10 @@ def surrogate_finding() -> Finding:
     return _compared("surrogate", float(prediction.mean.max()), SURROGATE_N, SURROGATE_TOLERANCE, started)
 
 
-def _compared(name: str, found_n: float, expected_n: float, tolerance: float, started: float) -> Finding:
+def _compared(name: str, computed_n: float, stored_n: float, tolerance: float, started: float) -> Finding:
     """Returns whether a force [N] equals the stored force within a relative tolerance."""
-    ok = math.isclose(found_n, expected_n, rel_tol=tolerance)
+    ok = math.isclose(computed_n, stored_n, rel_tol=tolerance)
     seconds = time.perf_counter() - started
     return Finding(
-        name, ok, f"{found_n:.6f} N in {seconds:.1f} s", f"{expected_n:.6f} N within {100 * tolerance:g} %"
+        name, ok, f"{computed_n:.6f} N in {seconds:.1f} s", f"{stored_n:.6f} N within {100 * tolerance:g} %"
     )

@@ -95,7 +95,9 @@ def skin_parameters(config: Config, where: object) -> ParameterSpace:
             problem = f"{first} and {second} have a correlation"
             remedy = f"only {', '.join(names)}, in which skins are compared, can have correlations among them"
             raise InputError(f"{where}: parameters", problem, remedy)
-    return ParameterSpace(compared, tuple(one for one in space.correlations if one.first in names))
+    return ParameterSpace(
+        compared, tuple(correlation for correlation in space.correlations if correlation.first in names)
+    )
 
 
 def make_folder(file: StudyFile, members: Sequence[Member]) -> None:

@@ -57,7 +57,7 @@ def set_by_blanks() -> list[Export]:
         Export(
             "unclear_blanks.txt",
             aligned("Run time Pad displacement Pull force", NUMBERS),
-            refused="above rows of 3 cells; expected a header; or import with --time 1",
+            refused="above rows of 3 cells; write a header, or import with --time 1",
             columns=NUMBERED,
             units=UNITS,
         ),
@@ -70,7 +70,7 @@ def set_by_blanks() -> list[Export]:
         Export(
             "blank_thousands_one_blank.txt",
             aligned("t_s d_mm Pull force_mN", preloaded),
-            refused=r"row 2: found '1 3\d\d\.\d' in columns 3 and 4, maybe one number",
+            refused=r"row 2: '1 3\d\d\.\d' in columns 3 and 4 may be one number",
         ),
         Export(
             "blank_thousands_zeros.txt",
@@ -179,7 +179,7 @@ def numbers() -> list[Export]:
         Export(
             "comma_twice.csv",
             text([HEADER, *COMMAS], ","),
-            refused="3 names above rows of 6 cells; expected a delimiter that is not the decimal sign",
+            refused="3 names stand above rows of 6 cells; the delimiter must not be the decimal sign",
         ),
         Export(
             "three_digits.csv",
@@ -219,7 +219,7 @@ def statements() -> list[Export]:
         Export(
             "minutes.csv",
             text([["Time", *HEADER[1:]], *cells(fixed(TIME_S / 60, 8), D, F)], ","),
-            refused="column 'Time' without a known unit; .*import with --unit time=UNIT",
+            refused="the unit of 'Time' is not known; .*import with --unit time=UNIT",
             units={"time": "min"},
         ),
         Export("percent.csv", text([[*HEADER, "Extension (%)"], *cells(T, D, F, strain)], ",")),
@@ -231,7 +231,7 @@ def statements() -> list[Export]:
         Export(
             "percent_no_unit.csv",
             text([["Time (s)", "Extension", "Load (N)"], *cells(T, strain, F)], ","),
-            refused="'Extension' without a known unit; .*import with --unit displacement=UNIT",
+            refused="the unit of 'Extension' is not known; .*import with --unit displacement=UNIT",
         ),
     ]
 
