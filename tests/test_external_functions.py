@@ -51,9 +51,9 @@ def test_a_diagnosis_solves_what_acts_on_the_force_beside_a_model_of_one_s_own(c
     measured = storage.load(file, Recording)
     storage.save(file, dataclasses.replace(measured, force_n=measured.force_n - 0.03))
     said = diagnose(case, Silent())
-    (one,) = said["mechanisms"]
-    assert one["name"] == "force-offset"
-    offset = one["parameters"]["F0"]
+    (mechanism,) = said["mechanisms"]
+    assert mechanism["name"] == "force-offset"
+    offset = mechanism["parameters"]["F0"]
     assert abs(offset["mean"] + 0.03) < 4.0 * offset["sd"] < 0.01
     assert said["full_model"]["rmse"] < NOISE_N
     for name, value in TRUE.items():
@@ -103,9 +103,9 @@ def test_a_function_that_raises_is_a_run_that_failed() -> None:
     def raising(theta, time_s, displacement_m):
         raise ValueError("too\nstiff")
 
-    found = simulate_with(raising, MOTION, TRUE)
-    assert found.status == "failed"
-    assert found.message.startswith("ValueError: too stiff (test_external_functions.py, line ")
+    run = simulate_with(raising, MOTION, TRUE)
+    assert run.status == "failed"
+    assert run.message.startswith("ValueError: too stiff (test_external_functions.py, line ")
 
 
 def test_a_function_is_asked_for_no_time_twice() -> None:

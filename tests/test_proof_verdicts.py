@@ -47,12 +47,12 @@ def test_a_diagnosis_that_fails_ends_no_set(concealed_set: Path, tmp_path: Path)
     copy = Path(shutil.copytree(concealed_set, tmp_path / "copy"))
     board = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]
     assert (len(seen), board["judged"]) == (COUNT, COUNT)
-    assert [one["answer"] for one in board["each"]][:3] == ["failed", "failed", "failed"]
+    assert [verdict["answer"] for verdict in board["each"]][:3] == ["failed", "failed", "failed"]
     again = pipeline.prove(copy, Silent(), diagnose=fails)[
         "scoreboard"
     ]  # those three once more, and no other
     assert len(seen) == COUNT + 3
-    assert "failed" not in [one["answer"] for one in again["each"]]
+    assert "failed" not in [verdict["answer"] for verdict in again["each"]]
 
 
 def test_a_set_is_worked_on_by_one_process(concealed_set: Path, tmp_path: Path) -> None:

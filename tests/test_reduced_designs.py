@@ -139,7 +139,7 @@ def test_the_hash_is_of_the_reduced_model_and_of_the_full_one(ships: Path, tmp_p
         ReducedOrFull(other, FullModel(ModelSpec())),
         ReducedOrFull(ships, FullModel(thick)),
     ]
-    assert len({one.hash for one in models} | {FullModel(ModelSpec()).hash}) == 4
+    assert len({model.hash for model in models} | {FullModel(ModelSpec()).hash}) == 4
 
 
 def test_the_reduced_model_of_the_very_geometry_goes_first(ships: Path, tmp_path: Path) -> None:

@@ -118,13 +118,15 @@ def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(
         "fit": {"windows_s": np.array([[0.0, 75.0]])},
         "seed": np.int64(3),
     }
-    one = bk.calibrate(recording, folder=tmp_path, **small)  # the shipped surrogate that knows the protocol
+    posterior = bk.calibrate(
+        recording, folder=tmp_path, **small
+    )  # the shipped surrogate that knows the protocol
     files = {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
     again = bk.calibrate(recording, folder=tmp_path, **small)
     assert len(files) == 2
     assert files == {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
-    np.testing.assert_array_equal(draws_of(one)[1], draws_of(again)[1])
-    config = json.loads(one.attrs["provenance"])["config"]
+    np.testing.assert_array_equal(draws_of(posterior)[1], draws_of(again)[1])
+    config = json.loads(posterior.attrs["provenance"])["config"]
     assert (config["seed"], config["fit"]["windows_s"]) == (3, [[0.0, 75.0]])
 
 
@@ -208,7 +210,7 @@ def test_a_configuration_written_out_reads_back_the_same(tmp_path: Path) -> None
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, bayeskin; print([m for m in ('numpy', 'arviz', 'numba') if m in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.strip() == "[]"
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = bk.nothing
