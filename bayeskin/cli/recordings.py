@@ -56,12 +56,11 @@ def import_(**options: Any) -> Mapping[str, Any]:
 def new(recordings: tuple[Path, ...], out: Path | None, device: Path | None) -> Mapping[str, Any]:
     """Write a commented configuration for recordings of your own; without any, write the demo's.
 
-    The command reads the recordings and reports what they contain. Several recordings must be of one skin. The
-    configuration of a single one uses a shipped surrogate if one was trained on the recording's protocol, and
-    a design of model runs otherwise. Existing files are
-    never overwritten. The demo's recording is written beside its configuration. With --device, the sections
-    [device] and [tissue] of that file are written into the configuration; without it, the article's device
-    and tissue are used.
+    The command reads the recordings and reports what they contain. Several recordings must be of one skin.
+    The configuration of a single one uses a shipped surrogate if one was trained on the recording's protocol,
+    and a design of model runs otherwise. Existing files are never overwritten. The demo's recording is
+    written beside its configuration. With --device, the sections [device] and [tissue] of that file are
+    written into the configuration; without it, the article's device and tissue are used.
 
     \b
     Example:
