@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LONGEST, _SMALLEST = 5, -4  # numbers between these powers of ten are written out
-_FAR = 100.0  # from this ratio of an interval's ends on, each end may have its own unit
+_FAR = 100.0  # smallest ratio of an interval's ends at which each end may have its own unit
 # A value of at least `size` is printed in the unit `name`, the largest first: (size in SI, factor, name).
 _SCALES = {
     "Pa": ((1e6, 1e-6, "MPa"), (1e3, 1e-3, "kPa"), (0.0, 1.0, "Pa")),

@@ -19,8 +19,8 @@ from bayeskin.geometry import BOUNDS_MM, ForceOn, Geometry, Guard, moved
 from bayeskin.types import Parameter
 
 EXPECTED = "a TOML file with the sections [device] and [tissue]"
-LARGEST_SD = 1 / 3  # as a share of the mean, so that a normal prior stays away from zero
-REACH = 3.0  # the prior of a length extends so many sd to either side of the mean
+LARGEST_SD = 1 / 3  # largest share of the mean, so that a normal prior stays away from zero
+REACH = 3.0  # number of sd by which the prior of a length extends to either side of the mean
 # Relative distance of a length's bounds from impossible lengths, because derivatives take small steps.
 ROOM = 1e-3
 _MEANING = {

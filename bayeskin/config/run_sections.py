@@ -44,7 +44,7 @@ class ModelConfig(Section):
 
     observation: Observation = "reaction"
     mesh: str = "bricks"
-    refinement: Refinement = 1  # of the bricks, towards the edges of the pads; 0 gives 80 bricks
+    refinement: Refinement = 1  # fineness of the bricks at the pads' edges; 0 gives 80 bricks
     forward: str | None = None
 
     @model_validator(mode="before")

@@ -102,7 +102,7 @@ class ForceGradients:
         self._in_series = bool(model.drive.elements)
         self._reach_m = 2.0 * model.drive.largest_m
         self._start = self._at_rest(theta["p_init"], changes.get("p_init", 0.0))
-        self._known: dict[int, Slopes] = {}  # by id of the state, which each entry keeps alive
+        self._known: dict[int, Slopes] = {}  # keys: id of the state, which the entry keeps alive
         self._phase: list[Slopes] = [self._start]  # derivatives at the ends of this phase's stages
         self._travel: Array | None = None
         self._corrector = Corrector(model)

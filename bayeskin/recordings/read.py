@@ -20,7 +20,7 @@ from bayeskin.recordings.text import Rows, rows_of_text
 from bayeskin.recordings.workbooks import rows_of_array, sheets_of_xls, sheets_of_xlsx
 from bayeskin.types import Recording
 
-ALL = "all"  # as the name of a sheet: every table of the file
+ALL = "all"  # this name of a sheet stands for every table of the file
 _WORKBOOKS = (".xlsx", ".xlsm", ".xls")
 _TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".tra", ".lvm", ".mach-1")
 _STORED = (".h5", ".hdf5")

@@ -43,7 +43,7 @@ from bayeskin.study import (
 )
 from bayeskin.types import Array
 
-_GROUPS = (MODEL, ACCENT, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", INK)  # of Okabe & Ito
+_GROUPS = (MODEL, ACCENT, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", INK)  # some are colours of Okabe & Ito
 _ROW_IN, _HIGHEST_IN = 0.115, 8.5  # height of one recording, and largest height of all of them
 _LEGIBLE_IN = 0.1  # distance of two labels
 _MARGIN = 0.35  # space beside the shrunk estimates, as a share of their range

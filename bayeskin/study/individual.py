@@ -191,7 +191,7 @@ def log_prior(space: ParameterSpace, x: Array) -> Array:
     """Returns the log density (...,) of a prior at logarithms x (..., d) of points within its bounds."""
     theta = np.exp(x)
     offset = np.array([parameter.offset if parameter.in_log else 0.0 for parameter in space.parameters])
-    slopes = np.where(space.is_log, theta / (theta + offset), theta)  # of the line by the logarithm
+    slopes = np.where(space.is_log, theta / (theta + offset), theta)  # d line / d log(theta)
     return np.asarray(space.log_density(space.to_line(theta)) + np.log(slopes).sum(axis=-1))
 
 

@@ -14,7 +14,7 @@ from bayeskin.study.layout import Layout
 from bayeskin.study.model import Priors
 from bayeskin.types import Parameter
 
-FEWEST_EFFECTIVE = 50.0  # effective draws from which on weighted draws can test a shrunk estimate
+FEWEST_EFFECTIVE = 50.0  # effective draws with which weighted draws can test a shrunk estimate
 _OFF = 0.25  # shift of a shrunk estimate, in its sd, above which the fitted likelihood counts as wrong
 _RESOLVED = 0.1  # ratio of an interval's ends below which a spread has only an upper bound
 

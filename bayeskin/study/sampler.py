@@ -22,9 +22,9 @@ class SamplerSettings:
     """Settings of the sampler. A sweep moves all parameters of a walker once.
 
     ensembles, walkers : number of independent ensembles, and even number of walkers in each
-    limits, max_sweeps : the ensembles end when the limits are met, or after so many sweeps
+    limits, max_sweeps : the ensembles end when the limits are met, or after `max_sweeps` sweeps
     first_check, growth : sweeps until the limits are first checked, and factor of the sweeps until the next
-    every, most : every so many sweeps are kept, and at most so many of those make the result
+    every, most : one of `every` sweeps is kept, and at most `most` of these make the result
     start_sds : range of the sds of all levels at the start
     """
 

@@ -16,7 +16,7 @@ from bayeskin.probe import bytes_of, refuse_endless
 MANDATORY, OPTIONAL = ("recording", "subject"), ("site", "group", "session", "device")
 COLUMNS = (*MANDATORY, *OPTIONAL)
 _MOST_BYTES = 1_000_000
-_FEWEST_SUBJECTS = 2  # of the study, and of each of its groups
+_FEWEST_SUBJECTS = 2  # smallest number in the study, and in each group
 _EXPECTED = "a table with one row for each recording"
 
 

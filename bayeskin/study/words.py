@@ -14,7 +14,7 @@ _LARGEST_CV = 10.0  # above this coefficient of variation, a percentage says lit
 _MORE = {
     1: "stiffer than",
     -1: "more permeable than",
-}  # by the power of a stress with which a parameter scales
+}  # keys: the power of a stress with which a parameter scales
 
 
 def sentences(population: Population) -> tuple[str, ...]:

@@ -166,7 +166,7 @@ def fit_latents(
     full, variances = all_components(shapes, weights)
     scores = (shapes - full.mean) @ full.components.T
     fits = [fit_one(inputs, amplitude - log_scale, weights)]
-    error, remainder = 0.0, float(variances.sum())  # for shapes, whose squares sum to the number of bins
+    error, remainder = 0.0, float(variances.sum())  # the squares of a shape sum to the number of bins
     usable = int(np.sum(variances > 1e-14 * remainder))
     for k in range(min(TRAINING.most_components, len(inputs) // 3, usable)):
         if remainder <= max(TRAINING.truncation_share * error, 1e-14 * shapes.shape[1]):

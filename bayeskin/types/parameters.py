@@ -52,7 +52,7 @@ class Parameter:
 
 
 class Correlation(NamedTuple):
-    """The correlation of the normal priors of two parameters, given by their names, on their lines."""
+    """The correlation of two normal priors, or of the logarithms of log-normal ones; parameters are named."""
 
     first: str
     second: str

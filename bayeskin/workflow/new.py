@@ -63,7 +63,7 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     )
     geometry, single = _geometry(stated), len(files) == 1
     width_s = max(map(fitting_width_s, recordings))
-    usual = single and not geometry.sd_m and width_s == BIN_WIDTH_S  # as the shipped surrogates were trained
+    usual = single and not geometry.sd_m and width_s == BIN_WIDTH_S  # shipped surrogates need all of these
     surrogate = shipped_for(motions[0], geometry.geometry) if usual else None
     reduced = None if surrogate else _reduced_for(motions, geometry.geometry, out)
     source, section = _surrogate_source(surrogate, reduced)

@@ -52,10 +52,11 @@ def prove(
     """Diagnoses the recordings without a verdict, scores all verdicts, and returns the command's answer.
 
     folder : the set, by default the shipped set; verdicts and scores are written into it
-    rediagnose : so many recordings, spread over the set, are diagnosed again in a temporary folder and
+    rediagnose : number of recordings, spread over the set, that are diagnosed again in a temporary folder and
         compared with their stored verdicts; a different verdict is a failure if the stored one is of the same
         sources
-    at_most : so many recordings without a verdict are diagnosed now; the recordings judged by then are scored
+    at_most : largest number of recordings without a verdict that are diagnosed now; the recordings that have
+        a verdict then are scored
 
     A diagnosis that fails has the verdict "failed" until a later call tries it again; the other recordings
     are diagnosed nevertheless. Each scoring is recorded. While recordings are diagnosed, the seals cannot be

@@ -38,7 +38,7 @@ from bayeskin.workflow.folder import locked
 from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
-REFINEMENT = 1  # of the bricks of the full model that reduced models replace
+REFINEMENT = 1  # refinement of the full model that reduced models replace
 EXPECTED = "a configuration, or a file with [device] and [tissue]"
 
 

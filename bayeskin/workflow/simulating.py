@@ -35,7 +35,7 @@ from bayeskin.workflow.recording import pad_motion
 from bayeskin.workflow.reducing import reduced_file
 from bayeskin.workflow.simulation_answer import simulation_answer
 
-REPORTED_EVERY_S = 0.1  # with mechanisms, because their force changes within a time step of the model
+REPORTED_EVERY_S = 0.1  # interval with mechanisms, whose force changes within a time step
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from bayeskin.workflow.page import write_page
 from bayeskin.workflow.stages import doubts_of, stages_of
 
 LAST = "sample"  # the stage with which the run of a recording ends
-MOST_DRAWS = 4000  # of a recording's posterior that are read
+MOST_DRAWS = 4000  # largest number of draws of a recording's posterior that are read
 
 
 @dataclass(frozen=True)
