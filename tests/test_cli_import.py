@@ -124,7 +124,7 @@ def test_names_that_are_not_utf8_are_read_and_written(bayeskin: Command, tmp_pat
     assert said.splitlines()[-1].endswith("r\\xe9sultat.h5")
     assert len(storage.load(out, Recording).time_s) == len(TIME_S)
     assert_refused(
-        bayeskin("new", source, "-o", tmp_path / "c.toml"), "a name that a configuration cannot contain"
+        bayeskin("new", source, "-o", tmp_path / "c.toml"), "a configuration cannot contain this name"
     )
 
 

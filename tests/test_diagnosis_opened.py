@@ -134,5 +134,5 @@ def test_what_recordings_may_share_is_listed(tmp_path: Path) -> None:
 
 def test_a_configuration_stands_beside_no_other_file(tmp_path: Path) -> None:
     first, _ = two(tmp_path)
-    with pytest.raises(InputError, match="a configuration beside other files"):
+    with pytest.raises(InputError, match="a configuration cannot be given with other files"):
         opened([tmp_path / "case.toml", first], Silent())

@@ -133,10 +133,10 @@ def test_a_function_is_asked_for_no_time_twice() -> None:
         ("spring.py:endless", PARAMETERS, "not finite"),
         ("spring.py:force", "", "KeyError: 'stiffness'"),
         ("spring.py:force", "[parameters.stiffness]\nlower = 1.0\n", "stiffness.upper: there is no value"),
-        ("spring.py:force", PARAMETERS + '[surrogate]\nfile = "demo.h5"\n', "a surrogate of another model"),
+        ("spring.py:force", PARAMETERS + '[surrogate]\nfile = "demo.h5"\n', "it belongs to another model"),
         ("ftp://here", PARAMETERS, "http://HOST:PORT"),
         ("http://here:port", PARAMETERS, "http://HOST:PORT"),
-        ("http://127.0.0.1:9", PARAMETERS, "no answer"),
+        ("http://127.0.0.1:9", PARAMETERS, "no server answers"),
     ],
 )
 def test_what_cannot_be_used_is_told_in_one_line(
@@ -150,7 +150,9 @@ def test_what_cannot_be_used_is_told_in_one_line(
 def test_own_and_full_models_are_not_mixed(case: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = case.parent / "f.csv"
     for option in (("--fields", "f"), ("--figures", "f"), ("--mechanism", "force-offset")):
-        assert "no fields, figures or mechanisms" in refused(capsys, "simulate", case, *option, "-o", out)
+        assert "leave out fields, figures and mechanisms" in refused(
+            capsys, "simulate", case, *option, "-o", out
+        )
     assert "a model of your own" in refused(capsys, "simulate", case, "--mesh", "bricks", "-o", out)
     case.write_text(case.read_text().replace('forward = "spring.py:force"', 'observation = "own"'))
     assert "it must be 'own' with model.forward" in refused(capsys, "simulate", case, "-o", out)

@@ -175,10 +175,10 @@ def test_instrument_mechanisms_bring_their_parameters(served: str) -> None:
         (
             [[1.0, 2.0, 3.0]],
             {"protocol": {"time_s": [0, 2], "displacement_m": [0]}},
-            "2 times, 1 displacements",
+            "2 times and 1 displacements",
         ),
-        ([[1.0, 2.0, 3.0]], {"times_s": [3.0, 500.0]}, "times within the protocol's 0 to 130 s"),
-        ([[1.0, 2.0, 3.0]], {"edges_s": [3.0]}, "1 edges"),
+        ([[1.0, 2.0, 3.0]], {"times_s": [3.0, 500.0]}, "within the protocol, 0 to 130 s"),
+        ([[1.0, 2.0, 3.0]], {"edges_s": [3.0]}, "the number of edges is 1"),
         ([[1.0, 2.0, 3.0]], {"mechanisms": ["wings"]}, "'wings' is not known; use some of amplifier-lag"),
         (
             [[1.0, 2.0, 3.0]],

@@ -102,7 +102,7 @@ def test_a_mesh_like_another_has_its_cells_with_nodes_moved_by_layer():
     assert volumes[~like.cutis].sum() == pytest.approx(0.105 * 0.084 * 36e-3, rel=5e-3)
     assert brick_mesh(1, thicker).geometry.p.max() > like.geometry.p.max()  # whose box is its own
     np.testing.assert_array_equal(brick_mesh(1, reference, like=reference).geometry.p, mesh.geometry.p)
-    with pytest.raises(InputError, match="other pads or another guard"):
+    with pytest.raises(InputError, match="its pads or its guard differ"):
         brick_mesh(1, PADS, like=reference)
 
 

@@ -133,7 +133,7 @@ def test_each_key_is_one_length(line: str, changed: dict[str, object], tmp_path:
         ("[device]\nguard_mm = { gap = 1, width = 8, side = 7 }", "use one of gap, width"),
         ('[tissue]\ncutis_mm = "thin"', 'tissue.cutis_mm: "thin" is not allowed; it must be a valid number'),
         ("[tissue]\ncutis_mm = { mean = 2 }", "tissue.cutis_mm.sd: there is no value"),
-        ("[tissue]\ncutis_mm = { mean = 2, sd = 1.0 }", "an sd of at most a third of the mean"),
+        ("[tissue]\ncutis_mm = { mean = 2, sd = 1.0 }", "an sd of 1 mm is too large for a mean of 2 mm"),
         (
             '[tissue]\narm_radius_mm = "round"',
             "tissue.arm_radius_mm: \"round\" is not allowed; it must be 'flat'",

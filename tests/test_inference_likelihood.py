@@ -299,7 +299,7 @@ def test_only_bins_wholly_inside_a_window_are_fitted() -> None:
     binned = empty_recording()
     assert np.flatnonzero(bins_in_windows(binned, [(3.5, 7.9)]) == 0).tolist() == [4, 5, 6]
     for bad in ([(5.0, 3.0)], [(0.0, 10.0), (5.0, 20.0)]):
-        with pytest.raises(InputError, match="windows in order"):
+        with pytest.raises(InputError, match="windows must be in order"):
             bins_in_windows(binned, bad)
     with pytest.raises(InputError, match="no bin"):
         noise_chain(binned, [(3.1, 3.9)])

@@ -205,11 +205,11 @@ def other_surrogate(problem: LogPosterior) -> LogPosterior:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (other_data, "a chain of different input: recording"),
-        (other_surrogate, "a chain of different input: surrogate"),
+        (other_data, "other inputs .its recording"),
+        (other_surrogate, "other inputs .its surrogate"),
         (
             lambda p: dataclasses.replace(p, fit_windows=((0.0, 0.5),)),
-            "a chain of different input: fit windows",
+            "other inputs .its fit windows",
         ),
     ],
 )
@@ -222,9 +222,9 @@ def test_chains_of_another_posterior_are_refused_and_kept(chains: Path, change, 
 
 def test_another_shape_seed_or_file_is_refused(chains: Path, tmp_path: Path) -> None:
     problem = line_problem()
-    with pytest.raises(InputError, match="a chain of different input: walkers"):
+    with pytest.raises(InputError, match=r"other inputs \(its walkers"):
         sample(problem, chains, 7, LINE_START, dataclasses.replace(SHORT, walkers=18))
-    with pytest.raises(InputError, match="a chain of different input: seed"):
+    with pytest.raises(InputError, match=r"other inputs \(its seed"):
         sample(problem, chains, 0, LINE_START, SHORT)
     toy = toy_problem(surrogate=ToySurrogate())
     with pytest.raises(InputError, match="a chain of a, b"):

@@ -199,7 +199,7 @@ def test_a_joint_prior_that_cannot_be_is_refused(tmp_path: Path, text: str, says
 def test_correlations_that_cannot_hold_together_are_refused():
     three = [Parameter(name, "Pa", -9.0, 9.0, "normal") for name in "abc"]
     pairs = (Correlation("a", "b", 0.9), Correlation("b", "c", 0.9), Correlation("a", "c", -0.9))
-    with pytest.raises(InputError, match="correlations that form a positive definite matrix"):
+    with pytest.raises(InputError, match="must be positive definite"):
         ParameterSpace(tuple(three), pairs)
 
 

@@ -296,8 +296,8 @@ def test_despiking_never_crosses_a_break() -> None:
 @pytest.mark.parametrize(
     ("edges", "said"),
     [
-        (np.array([0.0, 0.0, 1.0]), "edges that do not increase"), (np.array([0.0, 140.0]), "0 to 140 s"),
-        (np.array([-1.0, 1.0]), "-1 to 1 s"), (np.array([0.0, 1.0, 1.005]), "in 1-1.005 s"),
+        (np.array([0.0, 0.0, 1.0]), "the edges do not increase"), (np.array([0.0, 140.0]), "0 to 140 s"),
+        (np.array([-1.0, 1.0]), "-1 to 1 s"), (np.array([0.0, 1.0, 1.005]), "from 1 to 1.005 s"),
     ],
 )  # fmt: skip
 def test_edges_that_do_not_fit_are_refused(edges: np.ndarray, said: str) -> None:

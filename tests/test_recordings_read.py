@@ -177,7 +177,7 @@ def test_workbooks_are_read_from_the_one_sheet_with_the_columns(tmp_path: Path) 
     with pytest.raises(InputError, match=r"2 of its tables 'A', 'B' .*--sheet"):
         read_recording(both)
     assert_is_the_test(read_recording(both, sheet="B"))
-    with pytest.raises(InputError, match="a sheet 'C'"):
+    with pytest.raises(InputError, match="no sheet or table 'C'"):
         read_recording(both, sheet="C")
 
 
@@ -213,7 +213,7 @@ def spoiled(row: int, column: int, text: str) -> list[list[str]]:
         ),
         (
             [["Temps (s)", "Displacement (px)", "RF (N)"], *ROWS],
-            r"'Displacement \(px\)', is in the unit 'px'; .* m, cm, mm, .*--displacement",
+            r"'Displacement \(px\)' is in the unit 'px'; .* m, cm, mm, .*--displacement",
         ),
         (
             spoiled(3, 1, "abc"),
@@ -224,7 +224,7 @@ def spoiled(row: int, column: int, text: str) -> list[list[str]]:
         (spoiled(3, 1, "1,5"), r"row 5, .*contains '1,5'; it must be a number with the decimal sign '.'"),
         (spoiled(3, 1, "1_0"), r"row 5, .*contains '1_0'; it must be a number"),
         (spoiled(3, 2, "nan"), r"row 5, column 'RF \(N\)': the value is nan; it must be a finite number"),
-        (spoiled(3, 2, "-inf"), r"row 5, .*found -inf"),
+        (spoiled(3, 2, "-inf"), r"row 5, .*the value is -inf"),
         (spoiled(9, 0, "0.4"), r"row 11: the time is 0.4 s after 0.4 s"),
         (spoiled(9, 0, "0.1"), r"row 11: the time is 0.1 s after 0.4 s"),
         (
@@ -249,7 +249,7 @@ def spoiled(row: int, column: int, text: str) -> list[list[str]]:
         ([*[HEADER], *ROWS[:20], [], *ROWS[21:]], r"row 22: it is empty, although numbers follow in row 23"),
         (
             ROWS,
-            r"no names above rows of 3 cells; .* import with --time 1 --displacement 2",
+            r"no names stand above rows of 3 cells; .* import with --time 1 --displacement 2",
         ),
         ([["some", "text"]], r"no rows of numbers"),
         (

@@ -160,7 +160,7 @@ def test_the_reduced_model_of_the_very_geometry_goes_first(ships: Path, tmp_path
         ({"refinement = 3": 'mesh = "skin.msh"'}, "bricks with refinement 1 or more"),
         ({"refinement = 3": 'mesh = "a.msh"\nobservation = "article"'}, "bricks with refinement 1 or more"),
         ({"refinement = 3": "refinement = 0"}, "bricks with refinement 1 or more"),
-        ({"refinement = 3": 'forward = "own.py:force"'}, "no such line, because it concerns the full model"),
+        ({"refinement = 3": 'forward = "own.py:force"'}, "it concerns the full model"),
         ({'"reduced"': '"redced"'}, "design.coarse"),
         (
             {"[map]": "[tissue]\ncutis_mm = 4.0\n[map]"},

@@ -297,8 +297,8 @@ def test_a_mechanism_whose_first_fits_fail_is_fitted_from_where_a_probe_ran_or_a
 @pytest.mark.parametrize(
     ("kind", "says"),
     [
-        (RunTask, "no tissue for which the model runs;"),
-        (FitTask, "no tissue for which the model runs: the worker ended;"),
+        (RunTask, "runs for no tissue that they allow;"),
+        (FitTask, r"runs for no tissue that they allow \(the worker ended\);"),
     ],
 )
 def test_a_recording_on_which_no_skin_runs_is_refused(asked: Make, kind: type, says: str) -> None:

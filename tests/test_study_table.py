@@ -70,7 +70,7 @@ def test_optional_columns_may_be_absent_and_columns_come_in_any_order(table: Pat
         ("a.h5", ".", "row 2, column 'recording': '.': it is a folder"),
         ("a.h5", "a\x00.h5", "row 2, column 'recording'"),
         ("a.h5", "a" * 5000, "row 2, column 'recording'"),
-        ("a.h5", '"a.h5', "that is no table"),
+        ("a.h5", '"a.h5', "cannot be read as a row of cells"),
         ("recording,", "", "row 1: there is no column 'recording'"),
     ],
 )  # fmt: skip
@@ -85,7 +85,7 @@ def test_a_wrong_table_is_refused_with_its_row_and_column(
 
 @pytest.mark.parametrize("text", ["", "\n\n", "recording,subject\n", "recording,subject\na.h5,anna\n"])
 def test_a_table_without_two_subjects_is_refused(table: Path, text: str) -> None:
-    with pytest.raises(InputError, match="bayeskin needs a table"):
+    with pytest.raises(InputError, match=r"there is no header|number of subjects"):
         read(table, text)
 
 

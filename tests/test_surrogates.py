@@ -156,7 +156,7 @@ def test_outside_the_box_is_refused_by_name(gp):
     ("change", "match"),
     [
         (lambda d: replace(d, ok=np.arange(len(d.ok)) < 5), "at least 8"),
-        (lambda d: replace(d, force_n=np.zeros_like(d.force_n)), "zero force"),
+        (lambda d: replace(d, force_n=np.zeros_like(d.force_n)), "the force is zero"),
         (lambda d: replace(d, force_n=np.where(d.force_n > 1e-3, np.nan, d.force_n)), "finite"),
     ],
 )
@@ -222,8 +222,8 @@ def damage_origin(path):
         (damage_box, "hash"),
         (damage_version, "format is 99; it must be 5"),
         (damage_origin, "another origin"),
-        (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "not readable"),
-        (lambda path: path.write_text("time,force\n"), "not readable"),
+        (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "cannot be read"),
+        (lambda path: path.write_text("time,force\n"), "cannot be read"),
         (lambda path: path.unlink(), "no such file"),
     ],
 )
@@ -264,7 +264,7 @@ def of_shape(name, values):
         (of_shape("transform/mean", np.ones((2, 2))), r"transform: mean: the shape is \(2, 2\)"),
         (of_shape("transform/components", np.ones(3)), "transform: components: the shape"),
         (of_shape("transform/truncation", np.ones(1)), "transform: truncation: the shape"),
-        (of_shape("transform/mean", b"text"), "mean: found"),
+        (of_shape("transform/mean", b"text"), "mean: "),
         (of_shape("edges_s", np.ones((2, 2))), r"edges_s: the shape is \(2, 2\)"),
         (of_shape("edges_s", np.zeros(len(EDGES_S))), "edges_s: the edges do not increase"),
         (of_shape("edges_s", np.full(len(EDGES_S), np.nan)), "edges_s: some values are not finite"),

@@ -76,8 +76,11 @@ def test_a_prior_of_a_length_can_be_stated(tmp_path: Path) -> None:
             '[model]\nmesh = "skin.msh"\n',
             "tissue.cutis_mm: 'skin.msh' in [model] does not allow a mean and an sd",
         ),
-        ('[model]\nmesh = "skin.msh"\nobservation = "article"\n', "a mean and an sd, with 'article'"),
-        ('[model]\nforward = "own.py:force"\n', "a mean and an sd, with 'own'"),
+        (
+            '[model]\nmesh = "skin.msh"\nobservation = "article"\n',
+            "'article' in [model] does not allow a mean and an sd",
+        ),
+        ('[model]\nforward = "own.py:force"\n', "'own' in [model] does not allow a mean and an sd"),
     ],
 )
 def test_what_cannot_be_uncertain_is_refused(tmp_path: Path, more: str, says: str) -> None:

@@ -71,16 +71,17 @@ def _input_error(path: Path | str, complaint: ValidationError, root: type[Sectio
         assert isinstance(error, InputError)  # the checks of this package raise no other
         where = f"{key}.{error.where}" if key else error.where
         return InputError(f"{path}: {where}", error.problem, error.remedy)
-    _, should, rule = first["msg"].rpartition(" should ")  # as in "Input should be greater than 0"
+    text = first["msg"].replace("False", "false")  # as TOML writes it
+    _, should, rule = text.rpartition(" should ")  # as in "Input should be greater than 0"
     remedy = f"it must {rule}" if should else rule[:1].lower() + rule[1:]
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         remedy = "it must be a table"
     elif kind in ("list_type", "tuple_type"):
         remedy = "it must be a list"
     elif kind == "too_long":
-        remedy = f"it must have at most {first['ctx']['max_length']} entries"
+        remedy = f"the number of entries must be at most {first['ctx']['max_length']}"
     elif kind == "too_short":
-        remedy = f"it must have at least {first['ctx']['min_length']} entries"
+        remedy = f"the number of entries must be at least {first['ctx']['min_length']}"
     given_text = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
     return InputError(f"{path}: {key}", f"{given_text} is not allowed", remedy)
 
