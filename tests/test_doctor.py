@@ -100,7 +100,7 @@ def test_a_folder_without_room_or_access_is_told(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(tempfile, "TemporaryFile", denied)
     assert broken(doctor.examine(tmp_path)) == {
         "disk space": "0.0 GB free",
-        "write access": f"{tmp_path}: Permission denied",
+        "write access": f"{tmp_path}: permission denied",
     }
 
 

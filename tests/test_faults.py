@@ -99,7 +99,7 @@ def test_a_real_disk_that_is_full_is_told(case: Path, bayeskin: Command) -> None
         for name in ("case.toml", "spring.py"):
             shutil.copy(case.parent / name, disk)
         (disk / "measured.h5").symlink_to(case.parent / "measured.h5")
-        refused(bayeskin("design", disk / "case.toml"), "No space left on device")
+        refused(bayeskin("design", disk / "case.toml"), "no space left on device")
         refused(bayeskin("import", disk / "measured.h5", "-o", disk / "again.h5"), "")
         assert not (disk / "again.h5").exists()
     finally:
@@ -164,7 +164,7 @@ def test_a_read_only_folder_is_told(case: Path) -> None:
         assert done.stdout.split() == ["2", "2", "2"]
         assert "Traceback" not in done.stderr
         told = [line for line in done.stderr.splitlines() if line.startswith("bayeskin: ")]
-        assert ["Permission denied" in line for line in told] == [True, True, True]
+        assert ["permission denied" in line for line in told] == [True, True, True]
         assert sorted(p.name for p in case.parent.iterdir()) == ["case.toml", "measured.h5", "spring.py"]
     finally:
         case.parent.chmod(0o755)

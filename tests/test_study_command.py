@@ -168,7 +168,7 @@ def test_a_group_that_failures_leave_with_one_subject_ends_without_a_population(
     (tmp_path / "rec" / "d-1.h5").write_bytes(b"damaged")
     answer = run_study(tmp_path / finished.name, Silent())
     assert (answer["ok"], answer["verdict"]) == (False, "no population")
-    assert "a group of one subject" in answer["text"]
+    assert "has one subject only" in answer["text"]
     assert list(answer["left_out"]) == ["d-1", "e-1"]
     assert "d-1" in (tmp_path / "springs" / "report.html").read_text()
 
@@ -220,7 +220,7 @@ DEVICE = "[device]\ngauge_mm = 30.0\n"
         ({'table = "table.csv"': ""}, "", "springs.toml: table: there is no table"),
         ({'table = "table.csv"': "table = 3"}, "", "springs.toml: table: 3 is not the name of a file"),
         ({"table.csv": "none.csv"}, "", "none.csv: there is no such file"),
-        ({"[fit]": '[recording]\nfile = "a.h5"\n[fit]'}, "", "none, because the table names them"),
+        ({"[fit]": '[recording]\nfile = "a.h5"\n[fit]'}, "", "the table names the recordings"),
         ({"[fit]": "recording = 3\n[fit]"}, "", "springs.toml: "),
         ({"bin_width_s": "bin_width"}, "", "springs.toml: fit.bin_width: this key is not known"),
         ({"spring.py": "none.py"}, "", "none.py"),
@@ -229,7 +229,7 @@ DEVICE = "[device]\ngauge_mm = 30.0\n"
         ({}, "rec/e-1.h5,ella,scar\n", "'scar' has one subject only"),
         ({}, "rec/e-1.h5,ella,keloid,3\n", "cells is 4; it must be 3"),
         ({"lower = 10.0": "lower = -10.0", 'prior = "log-uniform"\nunit = "N/m"': "", "lower = 1.0":
-          "lower = -1.0", 'prior = "log-uniform"\nunit = "s"': ""}, "", "none that is always positive"),
+          "lower = -1.0", 'prior = "log-uniform"\nunit = "s"': ""}, "", "none is always positive"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_refused_in_one_line_and_nothing_is_written(
@@ -248,7 +248,7 @@ def test_wrong_input_is_refused_in_one_line_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("section", "says"),
     [
-        (DEVICE, "no such column, because"),
+        (DEVICE, "has the section [device]"),
         ('[surrogate]\nfile = "demo.h5"\n', "devices is 2; it must be one"),
         ("", "there is none for this device and tissue"),
     ],
