@@ -227,7 +227,7 @@ def test_another_shape_seed_or_file_is_refused(chains: Path, tmp_path: Path) -> 
     with pytest.raises(InputError, match=r"other inputs \(its seed"):
         sample(problem, chains, 0, LINE_START, SHORT)
     toy = toy_problem(surrogate=ToySurrogate())
-    with pytest.raises(InputError, match="a chain of a, b"):
+    with pytest.raises(InputError, match="this chain has the parameters a, b"):
         sample(toy, chains, 7, {**TRUTH, **NOISE}, dataclasses.replace(SHORT, walkers=24))
     (chains / "ensemble_0.h5").write_bytes(b"half a file")
     with pytest.raises(InputError, match="cannot be read as HDF5"):
