@@ -172,9 +172,9 @@ def _record_and_draw(
                 figures += report.save_figure(curves, folder / "detectability", stamp)
             return figures
     except InputError as error:
-        reporter.log(f"{error}: figure and scoring are not stored")
+        reporter.log(f"figure and scoring are not stored: {error}")
     except OSError as error:  # a set inside an installed package may be read-only
-        reporter.log(f"{folder}: figure and scoring are not stored ({reason_of(error)})")
+        reporter.log(f"figure and scoring are not stored: {folder}: {reason_of(error)}")
     return ()
 
 
