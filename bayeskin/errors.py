@@ -43,5 +43,5 @@ class Unavailable(InputError):
 
 def reason_of(error: Exception) -> str:
     """Returns why a file could not be read or written, e.g. "permission denied"."""
-    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return reason[:1].lower() + reason[1:]
+    reason = getattr(error, "strerror", None) or str(error)
+    return reason[:1].lower() + reason[1:] if reason else type(error).__name__

@@ -4,7 +4,6 @@ import os
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from bayeskin.config import load_config, parameter_space
@@ -177,7 +176,3 @@ def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=f": {message}; bayeskin needs a TOML"):
             load_config(path)
-
-
-def test_an_error_is_told_in_one_line_whatever_it_is_about() -> None:
-    assert str(InputError("a\nb", np.ones((2, 2)), "version 5")) == ("a b: [[1. 1.] [1. 1.]]; version 5")

@@ -259,7 +259,7 @@ def test_a_surrogate_of_another_model_is_refused(tmp_path: Path, bayeskin: Comma
     shutil.copy(ROOT / "data/demo.h5", tmp_path / "measured.h5")
     config = '[recording]\nfile = "measured.h5"\n[model]\nrefinement = 2\n[surrogate]\nfile = "demo.h5"\n'
     (tmp_path / "case.toml").write_text(config)
-    refused(bayeskin("train", tmp_path / "case.toml"), "a surrogate of another model")
+    refused(bayeskin("train", tmp_path / "case.toml"), "it belongs to another model")
 
 
 @pytest.mark.parametrize(
