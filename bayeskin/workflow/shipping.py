@@ -131,27 +131,18 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
         remedy = "use one of this configuration's [device] and [tissue], or a design without surrogate.file"
         raise InputError(where, "it belongs to another device or tissue", remedy)
     if (design.model_hash, manifest.get("model_hash")) != (waves_model(run).hash, model_spec(run).hash):
-        raise InputError(
-            where, "it belongs to another model", "use a surrogate of this configuration's model"
-        )
+        raise InputError(where, "it belongs to another model", "use one of this configuration's model")
     if manifest.get("motion_sha256") != motion_sha256(motion):
-        raise InputError(
-            where, "it belongs to another protocol", "use a surrogate of this recording's protocol"
-        )
+        raise InputError(where, "it belongs to another protocol", "use one of this recording's protocol")
     if len(design.edges_s) != len(binned.edges_s) or not np.allclose(design.edges_s, binned.edges_s):
         problem = f"it has {len(design.edges_s) - 1} bins to {design.edges_s[-1]:g} s"
-        remedy = (
-            f"it needs those of the recording, {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
-        )
+        remedy = f"the recording needs {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
         raise InputError(where, problem, remedy)
     for parameter in parameter_space(run.config, run.config_path).parameters:
         box = manifest["parameters"].get(parameter.name)
         if box is None:
-            raise InputError(
-                where,
-                f"it has no parameter {parameter.name}",
-                "use a surrogate with this configuration's parameters",
-            )
+            remedy = "use one with this configuration's parameters"
+            raise InputError(where, f"it has no parameter {parameter.name}", remedy)
         if parameter.lower < box["lower"] or parameter.upper > box["upper"]:
             raise InputError(
                 f"{run.config_path}: parameters.{parameter.name}",
