@@ -44,7 +44,7 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
     ("sample", "the sampler of the posterior, and when it stops", {
         "ensembles": "number of independent ensembles of walkers",
         "walkers": "number of walkers in each ensemble",
-        "effective_samples": "sampling stops when every parameter has so many effective samples",
+        "effective_samples": "sampling stops when every parameter has this number of effective samples",
         "max_steps": "sampling stops after this number of steps, even if the result is not trusted",
     }),
     ("check", "the check of the posterior with the full model", {
