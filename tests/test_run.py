@@ -125,9 +125,9 @@ def test_priors_with_their_sources_and_what_the_data_says_are_printed(folder: Pa
     summary = json.loads((folder / "case" / "summary.json").read_text())
     for stage in (None, "sample"):
         text = stages.run(folder / "case.toml", stage, Silent())["text"]
-        for name, one in summary["posterior"].items():
-            prior = one["prior"]
-            bounds = interval(prior["lower"], prior["upper"], one["unit"])
+        for name, parameter in summary["posterior"].items():
+            prior = parameter["prior"]
+            bounds = interval(prior["lower"], prior["upper"], parameter["unit"])
             assert f"  {name}: {prior['kind']}, {bounds}; {prior['source']}" in text
         assert [line for line in summary["identifiability"] if f"  {line}" not in text] == []
     assert set(summary["profiles"]) == set(SPACE.names)
@@ -136,7 +136,7 @@ def test_priors_with_their_sources_and_what_the_data_says_are_printed(folder: Pa
 def test_what_the_fit_leaves_is_tested_and_said(folder: Path) -> None:
     said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
     residuals = said["residuals"]
-    assert sum(one["bins"] for one in residuals["by_kind"].values()) == 75  # those fitted
+    assert sum(kind["bins"] for kind in residuals["by_kind"].values()) == 75  # those fitted
     assert residuals["passes"] == (residuals["sentence"] not in said["remarks"])
     shown = (folder / "case" / "report.html").read_text()
     assert str(prose(residuals["sentence"])) in shown

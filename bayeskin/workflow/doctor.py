@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import bayeskin
+from bayeskin.errors import reason_of
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 LEAST_FREE_BYTES = 500_000_000  # a run's folder with its chains takes a tenth of this
@@ -36,12 +37,12 @@ SURROGATE_N, SURROGATE_TOLERANCE = 0.378489, 1e-5  # the largest mean force of i
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check: whether the part works, what was found, and what would correct it."""
+    """The result of one check: whether the part works, its state, and what it needs."""
 
     name: str
     ok: bool
-    found: str
-    advice: str = ""
+    state: str
+    needed: str = ""
 
 
 def examine(folder: Path) -> dict[str, Any]:
@@ -60,8 +61,8 @@ def examine(folder: Path) -> dict[str, Any]:
     ]
     ok = all(finding.ok for finding in findings)
     lines = [
-        f"{'ok    ' if finding.ok else 'BROKEN'}  {finding.name}: {finding.found}"
-        + ("" if finding.ok else f"; expected {finding.advice}")
+        f"{'ok    ' if finding.ok else 'BROKEN'}  {finding.name}: {finding.state}"
+        + ("" if finding.ok else f"; needed: {finding.needed}")
         for finding in findings
     ]
     text = "\n".join([*lines, "all is well" if ok else "something is broken"])
@@ -149,8 +150,8 @@ def _threads() -> Finding:
 def _disk_space(folder: Path) -> Finding:
     """Returns whether the disk has enough free space for a run."""
     free = shutil.disk_usage(folder).free
-    expected = f"at least {LEAST_FREE_BYTES / 1e9:g} GB"
-    return Finding("disk space", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free", expected)
+    needed = f"at least {LEAST_FREE_BYTES / 1e9:g} GB"
+    return Finding("disk space", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free", needed)
 
 
 def _write_access(folder: Path) -> Finding:
@@ -160,7 +161,7 @@ def _write_access(folder: Path) -> Finding:
             handle.write(b"bayeskin")
     except OSError as error:
         return Finding(
-            "write access", False, f"{folder}: {error.strerror}", "a folder in which runs can be written"
+            "write access", False, f"{folder}: {reason_of(error)}", "a folder in which runs can be written"
         )
     return Finding("write access", True, str(folder))
 
@@ -190,10 +191,10 @@ def surrogate_finding() -> Finding:
     return _compared("surrogate", float(prediction.mean.max()), SURROGATE_N, SURROGATE_TOLERANCE, started)
 
 
-def _compared(name: str, found_n: float, expected_n: float, tolerance: float, started: float) -> Finding:
+def _compared(name: str, computed_n: float, stored_n: float, tolerance: float, started: float) -> Finding:
     """Returns whether a force [N] equals the stored force within a relative tolerance."""
-    ok = math.isclose(found_n, expected_n, rel_tol=tolerance)
+    ok = math.isclose(computed_n, stored_n, rel_tol=tolerance)
     seconds = time.perf_counter() - started
     return Finding(
-        name, ok, f"{found_n:.6f} N in {seconds:.1f} s", f"{expected_n:.6f} N within {100 * tolerance:g} %"
+        name, ok, f"{computed_n:.6f} N in {seconds:.1f} s", f"{stored_n:.6f} N within {100 * tolerance:g} %"
     )

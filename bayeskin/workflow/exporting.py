@@ -35,8 +35,8 @@ def export(config: Path, out: Path, reporter: Reporter) -> dict[str, Any]:
     run = open_run(config, reporter)
     state = standing(run, stages_of(run.config))["sample"][0]
     if state != "done":
-        expected = f"a posterior that is up to date, from bayeskin run {config}"
-        raise InputError(config, f"a posterior that is {state}", expected)
+        problem = f"the stage `sample` is {state}, so there is no posterior to export"
+        raise InputError(config, problem, f"use `bayeskin run {config}` first")
     space, draws = draws_of(load_inference_data(run.at("sample", "posterior.nc")))
     doubts = doubts_of(run)
     contents, says = WRITERS[out.suffix](run, space, draws, doubts)
@@ -87,7 +87,8 @@ def _materials(run: Run, space: ParameterSpace, draws: Array, doubts: list[str])
     """
     missing = [name for name in LAYERS_NEED if name not in space.names]
     if missing:
-        raise InputError(run.config_path, f"no parameter {', '.join(missing)}", "parameters of both layers")
+        problem = f"the run has no parameter {', '.join(missing)}"
+        raise InputError(run.config_path, problem, "FEBio's materials need the parameters of both layers")
     theta = dict(zip(space.names, map(float, np.median(draws, axis=0)), strict=True))
     remark = f"Medians of the posterior of {run.config.name} by bayeskin, in SI units."
     remark += "".join(f" The posterior is not to be trusted: {doubt}" for doubt in doubts)
