@@ -257,7 +257,8 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
                 _gram(design, bend, gram)
             sound = _factored(gram, z, curvature)
             decrement = _solved(curvature, gradient, change) if sound else np.inf
-            if step == 0 or gaussian or (sound and (attempt > 0 or not decrement > MODE_SEARCH.slow * before)):
+            slow = attempt == 0 and decrement > MODE_SEARCH.slow * before
+            if step == 0 or gaussian or (sound and not slow):
                 break
         if step > 0 and decrement < MODE_SEARCH.decrement:
             value -= 0.5 * decrement
@@ -278,10 +279,10 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
 @part
 def _is_normal(z: Array) -> bool:
     """Returns whether the prior of the surrogate's error is a normal density at z."""
+    near = True
     for a in range(len(z)):
-        if not abs(z[a]) <= ERROR_PRIOR.farthest:
-            return False
-    return True
+        near = near and abs(z[a]) <= ERROR_PRIOR.farthest
+    return near
 
 
 @part
