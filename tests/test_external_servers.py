@@ -36,7 +36,7 @@ from bayeskin.runner import run_design
 from bayeskin.store import Store
 from bayeskin.types import Parameter
 from bayeskin.workflow import stages
-from bayeskin.workflow.doctor import FULL_MODEL_N, THETA
+from bayeskin.workflow.doctor_models import FULL_MODEL_N, THETA
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.serve import Asked, ServedModel, open_server
 
