@@ -1,0 +1,115 @@
+"""The questions that a person can ask about a recording, and the commands that answer them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bayeskin.app import jobs
+from bayeskin.app.recordings import RecordingFolder
+from bayeskin.errors import InputError
+from bayeskin.workflow.diagnosis import stages_of as stages_of_diagnosis
+from bayeskin.workflow.engine import Silent, open_run, standing
+from bayeskin.workflow.new import new_config
+from bayeskin.workflow.stages import stages_of
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question, and what a person reads about the work that answers it."""
+
+    key: str
+    title: str
+    explanation: str
+    duration: str
+
+
+CALIBRATE = Question(
+    "calibrate",
+    "Calibrate",
+    "What is this skin made of? The answer has the stiffness and the permeability of both layers of the "
+    "skin, how certain they are, and a verdict on whether they can be trusted.",
+    "It usually takes three to ten minutes on the article's device, and longer on other devices.",
+)
+MISSING = Question(
+    "missing",
+    "What is missing",
+    "Which physics does the model leave out of this recording, and where? The answer shows how much better "
+    "the fit is with it.",
+    "It usually takes two to ten minutes, and up to an hour where many effects act.",
+)
+PREPARE = Question(
+    "prepare",
+    "Prepare this device",
+    "No reduced model for this device exists yet. It is built once, and makes both questions quick. "
+    "The question of what is missing needs it.",
+    "It takes two to three hours. A first version can be used after about ten minutes.",
+)
+QUESTIONS = {question.key: question for question in (CALIBRATE, MISSING, PREPARE)}
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage of the run that a job works on.
+
+    state : "done", "working" or "waiting"; seconds : its duration, or None before it is done
+    """
+
+    name: str
+    does: str
+    state: str
+    seconds: float | None
+
+
+def ask(folder: RecordingFolder, key: str) -> None:
+    """Starts, or continues, the job that answers a question about a recording.
+
+    The configuration is written anew if the recording or its device was changed since. Raises InputError if
+    a job of this recording runs already, or if the recording or its device cannot be used.
+    """
+    if key not in QUESTIONS:
+        raise InputError("question", repr(key), f"one of {', '.join(QUESTIONS)}")
+    for file, needed in ((folder.stored, "a recording that was read"), (folder.device, "a device")):
+        if not file.is_file():
+            raise InputError(folder.name, f"no {file.name}", needed)
+    refuse_running(folder)
+    changed_s = max(folder.stored.stat().st_mtime, folder.device.stat().st_mtime)
+    if not folder.config.is_file() or folder.config.stat().st_mtime < changed_s:
+        folder.config.unlink(missing_ok=True)
+        new_config([folder.stored], folder.config, folder.device)
+    jobs.start(folder.job, key, _commands(folder, key))
+
+
+def refuse_running(folder: RecordingFolder) -> None:
+    """Raises InputError if a job of a recording runs."""
+    job = jobs.job_of(folder.job)
+    if job is not None and job.running:
+        raise InputError(folder.name, "a job that runs", "that you stop the job first, or wait for its end")
+
+
+def _commands(folder: RecordingFolder, key: str) -> Sequence[Sequence[str]]:
+    """Returns the commands that answer a question; they run in the recording's folder."""
+    config = folder.config.name
+    return {
+        CALIBRATE.key: [["run", config]],
+        MISSING.key: [["diagnose", config], ["report", config]],
+        PREPARE.key: [["reduce", folder.device.name]],
+    }[key]
+
+
+def steps(folder: RecordingFolder, job: jobs.Job) -> list[Step]:
+    """Returns the stages that a job goes through; none for the preparation of a device."""
+    if job.question == PREPARE.key:
+        return []
+    run = open_run(folder.config, Silent())
+    stages = stages_of_diagnosis(run.config)
+    if job.question == CALIBRATE.key:
+        everything = stages_of(run.config)
+        stages = {name: everything[name] for name in (*everything["report"].needs, "report")}
+    made: list[Step] = []
+    for name, (state, record) in standing(run, stages).items():
+        done = state == "done"
+        first = job.running and not done and all(step.state == "done" for step in made)
+        shown = "done" if done else "working" if first else "waiting"
+        made.append(Step(name, stages[name].does, shown, record.seconds if record and done else None))
+    return made
