@@ -118,7 +118,7 @@ def test_from_a_dropped_file_to_the_report(entered: Browser, page: Page, measure
     until(lambda: text(entered, "#job .word") == "stopped")
     (folder / "fail").touch()
     entered.click("form[action$='/ask/calibrate'] button")
-    until(lambda: text(entered, "#job .word") == "done, not trusted")
+    until(lambda: text(entered, "#job .word") == "failed")
     fits(entered)
 
     report = entered.ask("document.querySelector('a[href$=\"/report\"]').href")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bayeskin.app.recordings import RecordingFolder
 from bayeskin.errors import InputError
@@ -32,14 +32,19 @@ class ParameterOfRuns:
 
 
 def answer_of(folder: RecordingFolder) -> Answer | None:
-    """Returns the answer of a recording's run as far as it is finished, or None where no run was started."""
+    """Returns the answer of a recording's run as far as it is finished, or None where no run was started.
+
+    It names no commands, since the page has buttons.
+    """
     if not folder.config.is_file():
         return None
     try:
         run = open_run(folder.config, Silent())
-        return answer(facts_of(run, stages_of(run.config)))
+        said = answer(facts_of(run, stages_of(run.config)))
     except InputError:
         return None
+    parts = {part: replace(getattr(said, part), command="") for part in ("made_of", "sure", "missing")}
+    return replace(said, **parts)
 
 
 def answered(folders: Sequence[RecordingFolder]) -> list[RunAnswer]:

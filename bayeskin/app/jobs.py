@@ -36,7 +36,7 @@ class State(StrEnum):
 
     RUNNING = "running"
     DONE = "done"
-    NOT_TRUSTED = "done, not trusted"
+    NOT_TRUSTED = "not trusted"
     REFUSED = "refused"
     STOPPED = "stopped"
     FAILED = "failed"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import timedelta
+from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from typing import Any
 from jinja2 import Environment
 
 from bayeskin.app import comparison, devices, jobs, reading
-from bayeskin.app.questions import MISSING, PREPARE, QUESTIONS, steps
+from bayeskin.app.questions import MISSING, PREPARE, QUESTIONS
 from bayeskin.app.recordings import RecordingFolder, Recordings
+from bayeskin.app.steps import steps
 from bayeskin.app.uploads import MOST_BYTES
 from bayeskin.errors import InputError
 from bayeskin.number_format import number, percent
@@ -40,7 +41,7 @@ def render(template: str, root: str, **parts: Any) -> str:
 
 def recordings_page(root: str, recordings: Recordings) -> str:
     """Returns the page with all recordings, and the place to drop a further one."""
-    rows = [(folder, jobs.job_of(folder.job)) for folder in recordings.all()]
+    rows = [(folder, _day(folder.dropped_s), jobs.job_of(folder.job)) for folder in recordings.all()]
     return render("recordings.html", root, rows=rows, titles=_TITLES, most_bytes=MOST_BYTES)
 
 
@@ -72,15 +73,19 @@ def recording_page(
     )  # fmt: skip
 
 
-def job_page(root: str, folder: RecordingFolder, job: jobs.Job) -> str:
+def job_page(root: str, recordings: Recordings, folder: RecordingFolder, job: jobs.Job) -> str:
     """Returns the page of a job: its progress with the time left, its steps, and its last lines."""
     now_s, lines = time.monotonic(), job.lines
+    stages = steps(folder, job, [other for other in recordings.all() if other != folder])
+    failed = any(step.state == "failed" for step in stages)
+    left_s = sum(step.left_s for step in stages)
     return render(
         "job.html", root, folder=folder, job=job, question=QUESTIONS[job.question],
-        tone=_TONES.get(job.state, "doubt"), refused=_refusal(job, lines),
-        so_far=_duration(job.seconds), tasks=[_task(task, now_s) for task in job.tasks if job.running],
-        steps=[{**asdict(step), "taken": None if step.seconds is None else _duration(step.seconds)}
-               for step in steps(folder, job)],
+        word="failed" if failed else str(job.state), tone="doubt" if failed else _tone(job),
+        refused=_refusal(job, lines), lines=lines, so_far=_duration(job.seconds),
+        left=_about(left_s) if job.running and stages else "",
+        tasks=[_task(task, now_s) for task in job.tasks if job.running],
+        steps=[{**asdict(step), "taken": _duration(step.seconds) if step.seconds else ""} for step in stages],
     )  # fmt: skip
 
 
@@ -141,6 +146,23 @@ def _questions(folder: RecordingFolder, stated: bool) -> list[Any]:
     unprepared = stated and not devices.has_reduced_model(folder)
     keys = [key for key in QUESTIONS if key != PREPARE.key or unprepared]
     return [QUESTIONS[key] for key in keys if key != MISSING.key or not unprepared]
+
+
+def _day(time_s: float) -> str:
+    """Returns a time of the local clock as a date with hours and minutes."""
+    return datetime.fromtimestamp(time_s).strftime("%Y-%m-%d %H:%M")
+
+
+def _tone(job: jobs.Job) -> str:
+    return _TONES.get(job.state, "doubt")
+
+
+def _about(seconds: float) -> str:
+    """Returns a rough duration in words."""
+    minutes = round(seconds / 60)
+    if minutes < 1:
+        return "less than a minute"
+    return f"about {minutes} minute{'s' * (minutes > 1)}"
 
 
 def _refusal(job: jobs.Job, lines: Sequence[str]) -> str:

@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from bayeskin.app import jobs
 from bayeskin.app.recordings import RecordingFolder
 from bayeskin.errors import InputError
-from bayeskin.workflow.diagnosis import stages_of as stages_of_diagnosis
-from bayeskin.workflow.engine import Silent, open_run, standing
 from bayeskin.workflow.new import new_config
-from bayeskin.workflow.stages import stages_of
 
 
 @dataclass(frozen=True)
@@ -48,19 +45,6 @@ PREPARE = Question(
 QUESTIONS = {question.key: question for question in (CALIBRATE, MISSING, PREPARE)}
 
 
-@dataclass(frozen=True)
-class Step:
-    """A stage of the run that a job works on.
-
-    state : "done", "working" or "waiting"; seconds : its duration, or None before it is done
-    """
-
-    name: str
-    does: str
-    state: str
-    seconds: float | None
-
-
 def ask(folder: RecordingFolder, key: str) -> None:
     """Starts, or continues, the job that answers a question about a recording.
 
@@ -95,21 +79,3 @@ def _commands(folder: RecordingFolder, key: str) -> Sequence[Sequence[str]]:
         MISSING.key: [["diagnose", config], ["report", config]],
         PREPARE.key: [["reduce", folder.device.name]],
     }[key]
-
-
-def steps(folder: RecordingFolder, job: jobs.Job) -> list[Step]:
-    """Returns the stages that a job goes through; none for the preparation of a device."""
-    if job.question == PREPARE.key:
-        return []
-    run = open_run(folder.config, Silent())
-    stages = stages_of_diagnosis(run.config)
-    if job.question == CALIBRATE.key:
-        everything = stages_of(run.config)
-        stages = {name: everything[name] for name in (*everything["report"].needs, "report")}
-    made: list[Step] = []
-    for name, (state, record) in standing(run, stages).items():
-        done = state == "done"
-        first = job.running and not done and all(step.state == "done" for step in made)
-        shown = "done" if done else "working" if first else "waiting"
-        made.append(Step(name, stages[name].does, shown, record.seconds if record and done else None))
-    return made

@@ -33,6 +33,11 @@ class RecordingFolder:
         return files[0] if files else None
 
     @property
+    def dropped_s(self) -> float:
+        """Returns when its file was dropped, in seconds since 1970."""
+        return (self.path / "original").stat().st_mtime
+
+    @property
     def stored(self) -> Path:
         """Returns the recording as `bayeskin import` writes it."""
         return self.path / f"{self.name}.h5"
@@ -76,8 +81,8 @@ class Recordings:
 
     def all(self) -> list[RecordingFolder]:
         """Returns the folders of all recordings, the newest first."""
-        folders = [path for path in self.root.iterdir() if _is_recording(path)]
-        return [RecordingFolder(path) for path in sorted(folders, key=_made_s, reverse=True)]
+        folders = [RecordingFolder(path) for path in self.root.iterdir() if _is_recording(path)]
+        return sorted(folders, key=lambda folder: folder.dropped_s, reverse=True)
 
     def named(self, name: str) -> RecordingFolder | None:
         """Returns the folder of a recording, or None for any name that no recording has."""
@@ -114,7 +119,3 @@ def open_recordings(root: Path) -> Recordings:
 
 def _is_recording(path: Path) -> bool:
     return path.is_dir() and not path.is_symlink() and (path / "original").is_dir()
-
-
-def _made_s(path: Path) -> float:
-    return (path / "original").stat().st_mtime

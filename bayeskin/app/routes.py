@@ -166,7 +166,7 @@ class Routes:
         job = jobs.job_of(folder.job)
         if job is None or job.question not in questions.QUESTIONS:
             raise HTTPException(404)
-        return HTMLResponse(pages.job_page(self.access.root, folder, job))
+        return HTMLResponse(pages.job_page(self.access.root, self.recordings, folder, job))
 
     def report(self, request: Request) -> Response:
         """Shows the report of a recording's run."""
