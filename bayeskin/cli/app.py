@@ -26,7 +26,7 @@ def app(folder: Path, port: int, as_json: bool) -> None:
 
     The command prints a link. Only a browser that opens this link can use the page, and only on this
     machine. The link is valid until Ctrl-C. A job goes on when the page is closed. The page needs the
-    packages of `pip install 'bayeskin[app]'`, and no network.
+    packages of `pip install '.[app]'`, and no network.
 
     \b
     Example:
@@ -39,7 +39,7 @@ def app(folder: Path, port: int, as_json: bool) -> None:
         if error.name not in ("starlette", "uvicorn"):
             raise
         raise InputError(
-            "app", f"no {error.name} installed", "the packages of `pip install 'bayeskin[app]'`"
+            "app", f"no {error.name} installed", "the packages of `pip install '.[app]'`"
         ) from None
     page = open_page(folder, port)
     print_answer(page.answer, as_json)
