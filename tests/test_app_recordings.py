@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from toys.app_page import Visitor, served
+from toys.app_page import DEVICE, Visitor, served
 from toys.laboratory_exports import NUMBERS, D, F, T
 from toys.laboratory_files import text, workbook
 
@@ -21,11 +21,6 @@ from bayeskin.config.device import DeviceFile, load_device_file
 from bayeskin.types import Recording
 
 BARE = text([["clock", "pull", "cell"], *NUMBERS], ";")
-DEVICE = {
-    "gauge": "20", "pad_length": "6", "pad_width": "10", "guard": "no", "guard_gap": "1", "guard_width": "8",
-    "force_on": "pad", "cutis": "1,5", "cutis_sd": "0.2", "subcutis": "5", "subcutis_sd": "", "flat": "yes",
-    "arm_radius": "", "arm_radius_sd": "",
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

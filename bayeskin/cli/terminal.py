@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from datetime import timedelta
-from pathlib import Path
 from typing import Any
 
 import click
@@ -15,7 +13,6 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, Tex
 from rich.text import Text
 
 from bayeskin.errors import InputError
-from bayeskin.workflow.progress import VARIABLE, ProgressFile, TaskProgress, begun
 
 DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -48,11 +45,10 @@ class Terminal:
             *columns, console=self.console, transient=True, disable=not self.console.is_terminal,
             get_time=clock,
         )  # fmt: skip
-        self.clock = clock
-        self.tasks: dict[str, TaskProgress] = {}
+        from bayeskin.workflow.progress import tasks_for_file
+
+        self._clock, self._tasks = clock, tasks_for_file()
         self._shown: dict[str, TaskID] = {}
-        named = os.environ.get(VARIABLE)
-        self._file = ProgressFile(Path(named)) if named else None
 
     def __enter__(self) -> Terminal:
         self.bars.start()
@@ -67,16 +63,12 @@ class Terminal:
 
     def progress(self, label: str, share: float, note: str = "") -> None:
         """Shows the share of a task that is done; a share that falls starts a new bar for the same task."""
-        before, now_s = self.tasks.get(label), self.clock()
-        task = begun(label, share, note, now_s) if before is None else before.later(share, note, now_s)
-        self.tasks[label] = task
-        if before is None or task.began_s != before.began_s:
+        task = self._tasks.report(label, share, note, self._clock())
+        if task.began_s == task.told_s:
             if label in self._shown:
                 self.bars.remove_task(self._shown[label])
             self._shown[label] = self.bars.add_task(label, total=1.0, progress=task)
         self.bars.update(self._shown[label], completed=share, progress=task, visible=share < 1.0)
-        if self._file is not None:
-            self._file.write(self.tasks.values(), at_once=before is None or share >= 1.0)
 
 
 def exit_code(call: Callable[[], Any]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 
 from bayeskin.errors import InputError
 from bayeskin.probe import bytes_of
+from bayeskin.recordings.headers import is_rule, is_unit_row
 from bayeskin.recordings.numbers import is_number
 from bayeskin.recordings.read import _sheets as sheets_of_workbook
 from bayeskin.recordings.text import TEXT, Rows, header_cells, rows_of_text
@@ -19,6 +20,7 @@ from bayeskin.recordings.workbooks import rows_of_array
 ABOVE, BELOW = 4, 5  # rows that are shown above and from the first row of numbers
 MOST_COLUMNS, LONGEST_CELL = 60, 80
 _ARRAY, _STORED = ".npy", (".h5", ".hdf5")
+Row = tuple[int, tuple[str, ...]]  # its number in the file, and its cells as text
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class SheetPreview:
     """
 
     sheet: str
-    rows: tuple[tuple[int, tuple[str, ...]], ...]
+    rows: tuple[Row, ...]
     names: tuple[str, ...]
 
 
@@ -53,17 +55,20 @@ def preview(path: Path) -> tuple[SheetPreview, ...]:
 
 
 def _beginning(name: str, rows: Rows) -> SheetPreview | None:
-    """Returns the beginning of a sheet, or None if it has no numbers or cannot be read."""
-    above: deque[tuple[int, tuple[str, ...]]] = deque(maxlen=ABOVE)
-    numbered = rows()
+    """Returns the beginning of a sheet, or None if it has no numbers or cannot be read.
+
+    Its numbers begin with the first of several rows that have numbers.
+    """
+    recent: deque[Row] = deque(maxlen=ABOVE + TEXT.run)
+    numbered, run = rows(), 0
     try:
         for number, row in islice(numbered, TEXT.header_within):
-            if sum(map(is_number, row)) > 1:
-                below = [(number, row), *islice(numbered, BELOW - 1)]
-                shown = (*above, *((n, _texts(cells)) for n, cells in below))
-                return SheetPreview(name, shown, _names(above, len(_texts(row))))
-            if texts := _texts(row):
-                above.append((number, texts))
+            recent.append((number, _texts(row)))
+            run = run + 1 if sum(map(is_number, row)) > 1 else 0
+            if run == TEXT.run:
+                below = [(n, _texts(cells)) for n, cells in islice(numbered, BELOW - run)]
+                above = [row for row in list(recent)[:-run] if row[1] and not is_rule(row[1])]
+                return SheetPreview(name, (*recent, *below), _names(above, len(_texts(row))))
     except InputError:
         return None
     return None
@@ -77,10 +82,14 @@ def _texts(row: Any) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def _names(above: deque[tuple[int, tuple[str, ...]]], width: int) -> tuple[str, ...]:
-    """Returns a text for each column, from the nearest row above that has one for each of them."""
+def _names(above: Sequence[Row], width: int) -> tuple[str, ...]:
+    """Returns a text for each column, from the nearest row above that has one for each; a unit is added."""
+    units: tuple[str, ...] = ("",) * width
     for _, texts in reversed(above):
         cells = texts if len(texts) > 1 else header_cells(texts[0], width) or ()
-        if len(cells) >= width:
-            return tuple(cells[:width])
-    return ("",) * width
+        if len(cells) < width:
+            continue
+        if not is_unit_row(cells):
+            return tuple(f"{name} {unit}".strip() for name, unit in zip(cells, units, strict=False))
+        units = tuple(cells[:width])
+    return units

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Iterable
+import math
+import os
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from pathlib import Path
 from bayeskin.json_files import write_json
 
 VARIABLE = "BAYESKIN_PROGRESS"  # names the file into which a command writes its progress
-REST_S = 0.5  # the file is written at most this often, except when a task begins or ends
+REST_S = 0.5  # between two writings of the file
 
 
 @dataclass(frozen=True)
@@ -50,20 +50,38 @@ def begun(label: str, share: float, note: str, now_s: float) -> TaskProgress:
     return TaskProgress(label, share, note, share, now_s, now_s)
 
 
-class ProgressFile:
-    """Writes the progress of all tasks into a file, which is replaced as a whole."""
+class Tasks:
+    """The progress of all tasks of a command, which is also written into a file if there is one.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._written_s = -REST_S
+    The file is replaced as a whole, at most every half second, except when a task begins or ends.
+    """
 
-    def write(self, tasks: Iterable[TaskProgress], at_once: bool) -> None:
-        """Writes the progress, unless it was written a moment ago. A file that cannot be written is left."""
-        now_s = time.monotonic()
-        if at_once or now_s - self._written_s >= REST_S:
+    def __init__(self, file: Path | None) -> None:
+        self._file = file
+        self._tasks: dict[str, TaskProgress] = {}
+        self._written_s = -math.inf
+
+    def report(self, label: str, share: float, note: str, now_s: float) -> TaskProgress:
+        """Takes a report, and returns the progress of its task."""
+        before = self._tasks.get(label)
+        task = begun(label, share, note, now_s) if before is None else before.later(share, note, now_s)
+        self._tasks[label] = task
+        if before is None or share >= 1.0 or now_s - self._written_s >= REST_S:
             self._written_s = now_s
+            self._write()
+        return task
+
+    def _write(self) -> None:
+        """Writes the file. One that cannot be written is left out, because the work is more important."""
+        if self._file is not None:
             with suppress(OSError):
-                write_json(self.path, [asdict(task) for task in tasks])
+                write_json(self._file, [asdict(task) for task in self._tasks.values()])
+
+
+def tasks_for_file() -> Tasks:
+    """Returns the tasks of a command, which are written into the file that the environment names."""
+    named = os.environ.get(VARIABLE)
+    return Tasks(Path(named) if named else None)
 
 
 def read_progress(path: Path) -> list[TaskProgress]:

@@ -13,6 +13,13 @@ from urllib.parse import urlencode, urlsplit
 
 from bayeskin.app.server import Page, open_page
 
+# The fields of a device that is not the article's, as a person fills them in.
+DEVICE = {
+    "gauge": "20", "pad_length": "6", "pad_width": "10", "guard": "no", "guard_gap": "1", "guard_width": "8",
+    "force_on": "pad", "cutis": "1,5", "cutis_sd": "0.2", "subcutis": "5", "subcutis_sd": "", "flat": "yes",
+    "arm_radius": "", "arm_radius_sd": "",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Answer:

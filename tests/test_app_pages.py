@@ -1,0 +1,162 @@
+"""What the page says beside the reports: comparisons of runs, the steps of a job, and the time left."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from toys.app_page import DEVICE, Visitor, served, until
+from toys.external_models import PARAMETERS, SPRING
+from toys.finished_run import facts
+from toys.small_study import record
+
+from bayeskin.app import jobs
+from bayeskin.app.comparison import RunAnswer, by_parameter, table
+from bayeskin.app.estimate import OVERRUN, SHIPPED_DESIGN_S, USUAL_S, seconds_left, usual_seconds
+from bayeskin.app.jobs import Job, State
+from bayeskin.app.questions import CALIBRATE
+from bayeskin.app.recordings import RecordingFolder
+from bayeskin.app.steps import steps
+from bayeskin.config import config_of
+from bayeskin.report.page.answer import answer
+from bayeskin.workflow.engine import Silent, open_run, run_stages
+from bayeskin.workflow.folder import Record, write_record
+from bayeskin.workflow.stages import stages_of
+
+CONFIG = """
+[recording]
+file = "a.h5"
+[model]
+forward = "spring.py:force"
+[fit]
+bin_width_s = 1.0
+[design]
+points = [24, 8]
+held_out = 6
+workers = 1
+[sample]
+ensembles = 2
+walkers = 20
+effective_samples = 100
+max_steps = 500
+[check]
+draws = 0
+[map]
+starts = 2
+evaluations = 500
+"""
+
+
+def test_runs_are_compared_parameter_by_parameter() -> None:
+    said = answer(facts())
+    without = replace(said, made=[made for made in said.made if made.name != "p_init"])
+    runs = [RunAnswer("left", said), RunAnswer("right", without)]
+    parameters = by_parameter(runs)
+    assert [(one.name, [name for name, _ in one.runs]) for one in parameters] == [
+        ("E_c", ["left", "right"]),
+        ("p_init", ["left"]),
+    ]
+    rows = [[cell.text for cell in cells] for cells in table(runs, parameters).rows]
+    assert [row[0] for row in rows] == ["left", "right"]
+    assert rows[0][1] == f"{said.made[0].median} ({said.made[0].interval})"
+    assert rows[1][2] == "–"
+    assert rows[0][-2:] == [said.sure.word, said.missing.word]
+
+
+def test_a_stage_takes_as_long_as_in_finished_runs_of_other_recordings(tmp_path: Path) -> None:
+    config = config_of({"name": "a", "recording": {"file": "a.h5"}}, "a.toml")
+    others = [RecordingFolder(tmp_path / name) for name in ("one", "two", "three", "four")]
+    assert usual_seconds("sample", config, others) == USUAL_S["sample"]
+    for other, seconds, done in zip(
+        others, (10.0, 30.0, 50.0, 900.0), (True, True, True, False), strict=True
+    ):
+        (other.run / "sample").mkdir(parents=True)
+        write_record(other.run / "sample", Record("0", done, seconds))
+    assert usual_seconds("sample", config, others) == 30.0
+    shipped = config_of({"name": "a", "recording": {"file": "a.h5"}, "surrogate": {"file": "demo.h5"}}, "a")
+    assert usual_seconds("design", shipped, others) == SHIPPED_DESIGN_S
+
+
+@pytest.mark.parametrize(
+    ("so_far_s", "tasks_left_s", "left_s"), [(0.0, [], 60.0), (20.0, [], 40.0), (20.0, [90.0], 90.0),
+                                             (200.0, [], OVERRUN * 200.0)],
+)  # fmt: skip
+def test_the_time_left_of_a_stage(so_far_s: float, tasks_left_s: list[float], left_s: float) -> None:
+    assert seconds_left(so_far_s, 60.0, tasks_left_s) == left_s
+
+
+@pytest.fixture(scope="module")
+def spring(tmp_path_factory: pytest.TempPathFactory) -> RecordingFolder:
+    """A recording whose run has its first two stages."""
+    folder = RecordingFolder(tmp_path_factory.mktemp("springs") / "a")
+    folder.path.mkdir()
+    record(folder.stored, 100.0, 1)
+    (folder.path / "spring.py").write_text(SPRING)
+    folder.config.write_text(CONFIG + PARAMETERS)
+    run = open_run(folder.config, Silent())
+    run_stages(run, stages_of(run.config), "design")
+    return folder
+
+
+def test_the_steps_of_a_job_show_how_its_stages_stand(spring: RecordingFolder) -> None:
+    spring.job.mkdir(exist_ok=True)
+    running = Job(spring.job, CALIBRATE.key, State.RUNNING, time.time(), None)
+    shown = steps(spring, running, [])
+    assert [step.state for step in shown] == ["done", "done", "working", *4 * ["waiting"]]
+    assert shown[1].seconds > 0.0
+    assert shown[1].left_s == 0.0
+    assert [step.left_s for step in shown[2:]] == [USUAL_S[step.name] for step in shown[2:]]
+    ended = replace(running, state=State.FAILED, ended_s=time.time())
+    train = spring.run / "train"
+    train.mkdir(exist_ok=True)
+    inputs = Record("0", False, 3.0, summary={"message": "no surrogate"})
+    write_record(train, inputs)
+    assert [step.state for step in steps(spring, ended, [])][2] == "waiting"  # of other inputs
+
+
+def test_a_step_that_works_counts_the_time_since_it_began(spring: RecordingFolder) -> None:
+    run = open_run(spring.config, Silent())
+    stages = stages_of(run.config)
+
+    class Stopped(Exception):
+        """Ends the stage in the midst of its work."""
+
+    def stop(_: object) -> dict[str, object]:
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        run_stages(run, {**stages, "train": replace(stages["train"], work=stop)}, "train")
+    file = spring.run / "train" / "stage.json"
+    os.utime(file, (time.time() - 100.0, time.time() - 100.0))
+    spring.job.mkdir(exist_ok=True)
+    running = Job(spring.job, CALIBRATE.key, State.RUNNING, time.time(), None)
+    working = steps(spring, running, [])[2]
+    assert working.state == "working"
+    assert working.seconds == pytest.approx(100.0, abs=10.0)
+    assert working.left_s == pytest.approx(OVERRUN * working.seconds)
+
+
+@pytest.mark.slow
+def test_two_calibrations_are_compared(tmp_path: Path) -> None:
+    with served(tmp_path / "recordings") as page:
+        owner = Visitor(page)
+        owner.enter()
+        for name, stiffness in (("soft", 100.0), ("stiff", 200.0)):
+            record(tmp_path / f"{name}.h5", stiffness, 1)
+            assert owner.drop(f"{name}.h5", (tmp_path / f"{name}.h5").read_bytes()).status == 200
+            assert owner.fill(f"/recordings/{name}/device", **DEVICE).status == 303
+            folder = RecordingFolder(page.folder / name)
+            (folder.path / "spring.py").write_text(SPRING)
+            folder.config.write_text(CONFIG.replace("a.h5", f"{name}.h5") + PARAMETERS)
+            assert owner.fill(f"/recordings/{name}/ask/calibrate").status == 303
+            until(lambda job=folder.job: not jobs.job_of(job).running, patience_s=600.0)
+            assert "Open the report" in owner.ask("GET", f"/recordings/{name}/job").text
+        shown = owner.ask("GET", "/compare?recording=soft&recording=stiff").text
+        assert (
+            shown.count('<p class="run-name">soft</p>') == shown.count('<p class="run-name">stiff</p>') == 9
+        )
+        assert "100 N/m" in shown
+        assert "200 N/m" in shown
