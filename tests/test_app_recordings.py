@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
+import socket
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from toys.app_page import DEVICE, Visitor, served
+from toys.app_page import DEVICE, Visitor, served, until
 from toys.laboratory_exports import NUMBERS, D, F, T
 from toys.laboratory_files import text, workbook
 
@@ -102,6 +104,18 @@ def test_a_file_that_is_too_large_is_refused_while_it_arrives(
     assert not list(owner.page.folder.glob("huge*"))
 
 
+def test_a_file_that_does_not_arrive_whole_is_not_kept(owner: Visitor) -> None:
+    access = owner.page.access
+    head = (
+        f"POST {access.root}/upload?name=half.csv HTTP/1.1\r\nHost: 127.0.0.1:{access.port}\r\n"
+        f"Origin: {owner.origin}\r\nCookie: bayeskin={owner.cookie}\r\nContent-Length: 100000\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", access.port)) as connection:
+        connection.sendall(head.encode() + BARE[:500])
+        until(lambda: list(owner.page.folder.glob("half/.dropped*")))
+    until(lambda: not list(owner.page.folder.glob("half")))
+
+
 def test_columns_and_units_are_corrected(owner: Visitor) -> None:
     at = dropped(owner, "bare.csv", BARE)
     shown = owner.ask("GET", at).text
@@ -157,7 +171,13 @@ def test_a_device_is_stated_by_its_fields(owner: Visitor, measured: Path) -> Non
     )
     assert stated.tissue.cutis_mm.mean == 1.5  # a decimal comma is understood
     assert (stated.tissue.cutis_mm.sd, stated.tissue.arm_radius_mm) == (0.2, "flat")
+    (owner.page.folder / "device/device").mkdir()
+    report = owner.page.folder / "device/device/report.html"
+    report.write_text("report")
+    assert "before the last change" not in owner.ask("GET", at).text
+    os.utime(report, (0.0, 0.0))
     shown = owner.ask("GET", at).text
+    assert "before the last change" in shown
     assert "Prepare this device" in shown  # no reduced model serves it
     assert f"{at}/ask/missing" not in shown
     other = dropped(owner, "other.csv", measured.read_bytes())

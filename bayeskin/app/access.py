@@ -112,6 +112,6 @@ class Guard:
 
         request = Request(scope)
         cookie = request.cookies.get(COOKIE, "")
-        refusal = self.access.refusal(request.method, request.url.path, request.headers, cookie)
+        refusal = self.access.refusal(request.method, scope["path"], request.headers, cookie)
         answer = PlainTextResponse(refusal, status_code=403) if refusal else self.app
         await answer(scope, receive, protected)

@@ -26,6 +26,7 @@ from bayeskin.workflow.progress import TaskProgress
 HERE = Path(__file__).parent
 _TITLES = {key: question.title for key, question in QUESTIONS.items()}
 _TONES = {jobs.State.DONE: "good", jobs.State.RUNNING: "none", jobs.State.STOPPED: "none"}
+_FINISHED = (jobs.State.DONE, jobs.State.NOT_TRUSTED)
 _PROBLEMS = ("reading", "device", "ask")  # the parts of a recording's page in which an error may stand
 
 
@@ -82,8 +83,8 @@ def job_page(root: str, recordings: Recordings, folder: RecordingFolder, job: jo
     return render(
         "job.html", root, folder=folder, job=job, question=QUESTIONS[job.question],
         word="failed" if failed else str(job.state), tone="doubt" if failed else _tone(job),
-        refused=_refusal(job, lines), lines=lines, so_far=_duration(job.seconds),
-        left=_about(left_s) if job.running and stages else "",
+        goes_on=failed or job.state not in _FINISHED, refused=_refusal(job, lines), lines=lines,
+        so_far=_duration(job.seconds), left=_about(left_s) if job.running and stages else "",
         tasks=[_task(task, now_s) for task in job.tasks if job.running],
         steps=[{**asdict(step), "taken": _duration(step.seconds) if step.seconds else ""} for step in stages],
     )  # fmt: skip

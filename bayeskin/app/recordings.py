@@ -68,6 +68,12 @@ class RecordingFolder:
         return self.run / "report.html"
 
     @property
+    def report_is_old(self) -> bool:
+        """Returns whether the recording or its device was changed after the report was written."""
+        inputs = [file.stat().st_mtime for file in (self.stored, self.device) if file.is_file()]
+        return self.report.is_file() and self.report.stat().st_mtime < max(inputs, default=0.0)
+
+    @property
     def job(self) -> Path:
         """Returns the folder of the last job."""
         return self.path / "job"

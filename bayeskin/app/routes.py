@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import (
     FileResponse,
     HTMLResponse,
@@ -108,6 +108,8 @@ class Routes:
             folder = await receive(self.recordings, request.query_params.get("name", ""), request.stream())
         except InputError as error:
             return JSONResponse({"error": str(error)}, status_code=400)
+        except ClientDisconnect:
+            return Response(status_code=400)
         return JSONResponse({"at": f"{self.access.root}/recordings/{folder.name}"})
 
     def compare(self, request: Request) -> Response:

@@ -1,41 +1,48 @@
 "use strict";
 (() => {
-  // A dropped or chosen file is sent as it is; the answer names the page of the new recording.
+  // Dropped or chosen files are sent as they are, one after the other. The answer names the page of a recording.
   const drop = document.querySelector(".drop");
-  const send = (file) => {
-    const bar = drop.querySelector("progress");
-    const problem = drop.querySelector(".problem");
-    const fail = (text) => {
-      bar.hidden = true;
-      problem.textContent = text;
-      problem.hidden = false;
-    };
+  const send = (file, bar) => new Promise((arrived, refused) => {
     if (file.size > Number(drop.dataset.most)) {
-      fail(`${file.name}: this file is too large`);
+      refused(`${file.name}: this file is too large`);
       return;
     }
-    problem.hidden = true;
-    bar.hidden = false;
     const request = new XMLHttpRequest();
     request.open("POST", `${drop.dataset.to}?name=${encodeURIComponent(file.name)}`);
     request.responseType = "json";
     request.upload.addEventListener("progress", (event) => { bar.value = event.loaded / event.total; });
     request.addEventListener("load", () => {
-      if (request.status === 200) location.assign(request.response.at);
-      else fail(request.response?.error ?? "The file could not be sent.");
+      if (request.status === 200) arrived(request.response.at);
+      else refused(request.response?.error ?? "The file could not be sent.");
     });
-    request.addEventListener("error", () => fail("The file could not be sent. Does `bayeskin app` still run?"));
+    request.addEventListener("error", () => refused("The file could not be sent. Does `bayeskin app` still run?"));
     request.send(file);
+  });
+  const sendAll = async (files) => {
+    const bar = drop.querySelector("progress");
+    const problem = drop.querySelector(".problem");
+    problem.hidden = true;
+    bar.hidden = false;
+    let at = "";
+    try {
+      for (const file of files) at = await send(file, bar);
+      location.assign(files.length === 1 ? at : location.href);
+    } catch (line) {
+      bar.hidden = true;
+      problem.textContent = line;
+      problem.hidden = false;
+    }
   };
   if (drop) {
     for (const name of ["dragover", "dragleave", "drop"]) {
       addEventListener(name, (event) => {
         event.preventDefault();
         drop.classList.toggle("over", name === "dragover");
-        if (name === "drop" && event.dataTransfer.files.length) send(event.dataTransfer.files[0]);
+        if (name === "drop" && event.dataTransfer.files.length) sendAll([...event.dataTransfer.files]);
       });
     }
-    drop.querySelector("input").addEventListener("change", (event) => send(event.target.files[0]));
+    const chosen = drop.querySelector("input");
+    chosen.addEventListener("change", () => sendAll([...chosen.files]));
   }
 
   // The page of a job that runs is fetched again every second, and its changing parts are taken over.
