@@ -75,10 +75,10 @@ def test_a_sound_file_is_read_at_once(owner: Visitor, measured: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
-        ("empty.csv", b"", "empty.csv: found an empty file"),
+        ("empty.csv", b"", "empty.csv: the file is empty"),
         ("noise.xlsx", bytes(range(256)) * 40, "an xlsx workbook"),
         ("letter.txt", b"Dear reader,\nthis is no table.\n", "no rows of numbers"),
-        ("name", b"1,2,3\n", "the ending ''"),
+        ("name", b"1,2,3\n", "is no ending of a table"),
         ("broken.h5", b"\x89HDF\r\n\x1a\n" + bytes(200), "broken.h5"),
     ],
 )
@@ -100,7 +100,7 @@ def test_a_file_that_is_too_large_is_refused_while_it_arrives(
 ) -> None:
     monkeypatch.setattr(uploads, "MOST_BYTES", 1000)
     answer = owner.drop("huge.csv", BARE)
-    assert (answer.status, "more than" in answer.text) == (400, True)
+    assert (answer.status, "the file has more than" in answer.text) == (400, True)
     assert not list(owner.page.folder.glob("huge*"))
 
 
@@ -119,7 +119,7 @@ def test_a_file_that_does_not_arrive_whole_is_not_kept(owner: Visitor) -> None:
 def test_columns_and_units_are_corrected(owner: Visitor) -> None:
     at = dropped(owner, "bare.csv", BARE)
     shown = owner.ask("GET", at).text
-    assert "expected a time column" in shown
+    assert "there is no time column" in shown
     assert '<option value="2">2: pull</option>' in shown  # the file's columns can be chosen
     fields = {"column-time": "1", "unit-time": "s", "column-displacement": "2", "unit-displacement": "mm",
               "column-force": "3", "unit-force": "-mN", "zero": ""}  # fmt: skip
@@ -135,7 +135,7 @@ def test_a_wrong_correction_leaves_the_earlier_reading(owner: Visitor, measured:
     before = (owner.page.folder / "kept/kept.h5").read_bytes()
     assert owner.fill(f"{at}/reading", **{"column-force": "7"}).status == 303
     shown = owner.ask("GET", at).text
-    assert re.search(r"kept.csv, row 1: --force 7: found columns .* expected a column", shown)
+    assert re.search(r"kept.csv, row 1: --force 7: the columns are .* name one of these columns", shown)
     assert "as it was read before" in shown
     assert (owner.page.folder / "kept/kept.h5").read_bytes() == before
 
@@ -147,7 +147,7 @@ def test_a_table_of_a_workbook_is_chosen(owner: Visitor) -> None:
     owner.fill(f"{at}/reading", sheet="second")
     assert (owner.page.folder / "book/book.h5").is_file()
     owner.fill(f"{at}/reading", sheet="all")
-    assert "the name of a single table" in owner.ask("GET", at).text
+    assert "name a single one" in owner.ask("GET", at).text
 
 
 def test_text_of_a_file_is_shown_as_text(owner: Visitor) -> None:
@@ -188,11 +188,15 @@ def test_a_device_is_stated_by_its_fields(owner: Visitor, measured: Path) -> Non
 @pytest.mark.parametrize(
     ("field", "given", "says"),
     [
-        ("gauge", "long", "device: device.gauge_mm: found &#34;long&#34;; expected a valid number"),
+        (
+            "gauge",
+            "long",
+            "device: device.gauge_mm: &#34;long&#34; is not allowed; it must be a valid number",
+        ),
         ("gauge", "-3", "device: device.gauge_mm"),
         ("gauge", "nan", "device.gauge_mm"),
         ("force_on", "arm", "device: device.force_on"),
-        ("cutis_sd", "9", "an sd of at most a third of the mean"),
+        ("cutis_sd", "9", "it must be at most a third of the mean"),
     ],
 )
 def test_an_impossible_device_is_refused_in_one_line(

@@ -43,7 +43,7 @@ def answer_of(folder: RecordingFolder) -> Answer | None:
         said = answer(facts_of(run, stages_of(run.config)))
     except InputError:
         return None
-    parts = {part: replace(getattr(said, part), command="") for part in ("made_of", "sure", "missing")}
+    parts = {part: replace(getattr(said, part), command="") for part in ("material", "sure", "missing")}
     return replace(said, **parts)
 
 
@@ -55,21 +55,20 @@ def answered(folders: Sequence[RecordingFolder]) -> list[RunAnswer]:
 
 def by_parameter(runs: Sequence[RunAnswer]) -> list[ParameterOfRuns]:
     """Returns the parameters of several runs, each with its posterior in all of them."""
-    names = {made.name: made.meaning for run in runs for made in run.answer.made}
+    summaries = [(run.name, summary) for run in runs for summary in run.answer.parameters]
+    meanings = {summary.name: summary.meaning for _, summary in summaries}
     return [
-        ParameterOfRuns(
-            name, meaning, [(run.name, made) for run in runs for made in run.answer.made if made.name == name]
-        )
-        for name, meaning in names.items()
+        ParameterOfRuns(parameter, meaning, [pair for pair in summaries if pair[1].name == parameter])
+        for parameter, meaning in meanings.items()
     ]
 
 
 def table(runs: Sequence[RunAnswer], parameters: Sequence[ParameterOfRuns]) -> Table:
     """Returns a table with a row for each run: its posteriors, the trust in them, and what is missing."""
-    head = ("recording", *(one.name for one in parameters), "how sure", "what is missing")
+    head = ("recording", *(parameter.name for parameter in parameters), "how sure", "what is missing")
     rows = []
     for run in runs:
-        made = {one.name: f"{one.median} ({one.interval})" for one in run.answer.made}
-        values = [made.get(one.name, "–") for one in parameters]
+        known = {summary.name: f"{summary.median} ({summary.interval})" for summary in run.answer.parameters}
+        values = [known.get(parameter.name, "–") for parameter in parameters]
         rows.append(row((run.name, *values, run.answer.sure.word, run.answer.missing.word)))
     return Table("Posterior medians with 90 % intervals", head, rows)

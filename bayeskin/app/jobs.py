@@ -96,7 +96,7 @@ def start(folder: Path, question: str, commands: Sequence[Sequence[str]]) -> Non
     folder.mkdir(exist_ok=True)
     with open(folder / LOCK, "a+") as lock:
         if not _locked(lock):
-            raise InputError(folder.parent.name, "a job that runs", "one job at a time for each recording")
+            raise InputError(folder.parent.name, "a job runs already", "stop it first, or wait for its end")
         for name in (END, PROGRESS):
             (folder / name).unlink(missing_ok=True)
         write_json(folder / REQUEST, {"question": question, "commands": commands, "started_s": time.time()})

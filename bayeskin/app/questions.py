@@ -52,10 +52,11 @@ def ask(folder: RecordingFolder, key: str) -> None:
     a job of this recording runs already, or if the recording or its device cannot be used.
     """
     if key not in QUESTIONS:
-        raise InputError("question", repr(key), f"one of {', '.join(QUESTIONS)}")
-    for file, needed in ((folder.stored, "a recording that was read"), (folder.device, "a device")):
-        if not file.is_file():
-            raise InputError(folder.name, f"no {file.name}", needed)
+        raise InputError("question", f"{key!r} is not known", f"ask one of {', '.join(QUESTIONS)}")
+    if not folder.stored.is_file():
+        raise InputError(folder.name, "the recording was not read", "correct how it was understood")
+    if not folder.device.is_file():
+        raise InputError(folder.name, "the device is not stated", "state it first")
     refuse_running(folder)
     changed_s = max(folder.stored.stat().st_mtime, folder.device.stat().st_mtime)
     if not folder.config.is_file() or folder.config.stat().st_mtime < changed_s:
@@ -68,7 +69,7 @@ def refuse_running(folder: RecordingFolder) -> None:
     """Raises InputError if a job of a recording runs."""
     job = jobs.job_of(folder.job)
     if job is not None and job.running:
-        raise InputError(folder.name, "a job that runs", "that you stop the job first, or wait for its end")
+        raise InputError(folder.name, "a job runs already", "stop it first, or wait for its end")
 
 
 def _commands(folder: RecordingFolder, key: str) -> Sequence[Sequence[str]]:

@@ -74,9 +74,9 @@ def read_as(folder: RecordingFolder, choice: Choice) -> Reading:
         reading = Reading(choice, _imported(folder, choice), None)
     except InputError as error:
         where = error.where.replace(f"{folder.path}/original/", "")
-        reading = Reading(choice, before.answer, InputError(where, error.found, error.expected))
+        reading = Reading(choice, before.answer, InputError(where, error.problem, error.remedy))
     said = reading.error
-    parts = (said.where, said.found, said.expected) if said else None
+    parts = (said.where, said.problem, said.remedy) if said else None
     write_json(folder.reading, {"choice": asdict(choice), "answer": reading.answer, "error": parts})
     return reading
 
@@ -84,9 +84,9 @@ def read_as(folder: RecordingFolder, choice: Choice) -> Reading:
 def _imported(folder: RecordingFolder, choice: Choice) -> dict[str, Any]:
     """Writes the recording as `bayeskin import` does, and returns its answer, or raises InputError."""
     if choice.sheet == ALL:
-        raise InputError("table", repr(ALL), "the name of a single table")
+        raise InputError("table", f"{ALL!r} means all tables", "name a single one")
     if choice.zero not in ZERO:
-        raise InputError("zero", repr(choice.zero), f"one of {', '.join(map(repr, ZERO))}")
+        raise InputError("zero", f"{choice.zero!r} is not known", f"use one of {', '.join(map(repr, ZERO))}")
     assert folder.original is not None
     units = [f"{quantity}={unit}" for quantity, unit in choice.units.items() if unit]
     columns = {quantity: column or None for quantity, column in choice.columns.items()}

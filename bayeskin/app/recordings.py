@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 _LONGEST = 60
@@ -119,7 +119,9 @@ def open_recordings(root: Path) -> Recordings:
     try:
         root.mkdir(mode=_PRIVATE, parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(root, error.strerror, "a folder that can be made") from None
+        raise InputError(
+            root, f"the folder cannot be made ({reason_of(error)})", "name another folder"
+        ) from None
     return Recordings(root.resolve())
 
 

@@ -49,7 +49,7 @@ class Routes:
 
     def app(self) -> Starlette:
         """Returns the application with all its paths."""
-        one = "/recordings/{name}"
+        at = "/recordings/{name}"
         routes = [
             Route(ENTRANCE, self.enter),
             Route("/", self.list),
@@ -58,14 +58,14 @@ class Routes:
             Route("/app.js", self.app_script),
             Route("/upload", self.upload, methods=["POST"]),
             Route("/compare", self.compare),
-            Route(one, self.recording),
-            Route(f"{one}/reading", self.read, methods=["POST"]),
-            Route(f"{one}/device", self.state_device, methods=["POST"]),
-            Route(f"{one}/ask/{{question}}", self.ask, methods=["POST"]),
-            Route(f"{one}/stop", self.stop, methods=["POST"]),
-            Route(f"{one}/job", self.job),
-            Route(f"{one}/report", self.report),
-            Route(f"{one}/download", self.download),
+            Route(at, self.recording),
+            Route(f"{at}/reading", self.read, methods=["POST"]),
+            Route(f"{at}/device", self.state_device, methods=["POST"]),
+            Route(f"{at}/ask/{{question}}", self.ask, methods=["POST"]),
+            Route(f"{at}/stop", self.stop, methods=["POST"]),
+            Route(f"{at}/job", self.job),
+            Route(f"{at}/report", self.report),
+            Route(f"{at}/download", self.download),
         ]
         handlers = {InputError: self.refused, HTTPException: self.refused}
         return Starlette(routes=[Mount(self.access.root, routes=routes)], exception_handlers=handlers)
@@ -206,7 +206,7 @@ class Routes:
         """
         folder, form = self._folder(request), await _form(request)
 
-        def made() -> Response:
+        def answer() -> Response:
             with self._changing:
                 try:
                     at = change(folder, form)
@@ -216,7 +216,7 @@ class Routes:
                     return HTMLResponse(text, status_code=400)
             return RedirectResponse(f"{self.access.root}/recordings/{folder.name}{at}", status_code=303)
 
-        return await run_in_threadpool(made)
+        return await run_in_threadpool(answer)
 
 
 async def _form(request: Request) -> dict[str, str]:

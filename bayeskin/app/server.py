@@ -13,7 +13,7 @@ import uvicorn
 from bayeskin.app.access import HOST, Access, Guard
 from bayeskin.app.recordings import open_recordings
 from bayeskin.app.routes import Routes
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 
 PATIENCE_S = 3  # for requests that are being answered when the page is closed
 
@@ -56,7 +56,9 @@ def open_page(folder: Path, port: int) -> Page:
         listening.listen()
     except OSError as error:
         listening.close()
-        raise InputError(f"{HOST}:{port}", str(error), "a free port") from None
+        raise InputError(
+            f"{HOST}:{port}", f"the page cannot listen there ({reason_of(error)})", "use a free port"
+        ) from None
     access = Access(listening.getsockname()[1])
     config = uvicorn.Config(
         Guard(Routes(access, recordings).app(), access), lifespan="off", ws="none", access_log=False,

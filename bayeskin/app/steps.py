@@ -41,12 +41,12 @@ def steps(folder: RecordingFolder, job: Job, others: Sequence[RecordingFolder]) 
         return []
     run = open_run(folder.config, Silent())
     stages = _stages(run, job)
-    made: list[Step] = []
+    shown: list[Step] = []
     for name, (stands, record) in standing(run, stages).items():
-        begun = job.running and all(step.state == "done" for step in made)
+        begun = job.running and all(step.state == "done" for step in shown)
         usual_s = usual_seconds(name, run.config, others)
-        made.append(_step(run, stages[name], stands, record, job if begun else None, usual_s))
-    return made
+        shown.append(_step(run, stages[name], stands, record, job if begun else None, usual_s))
+    return shown
 
 
 def _stages(run: Run, job: Job) -> Mapping[str, Stage]:

@@ -27,7 +27,8 @@ async def receive(recordings: Recordings, file_name: str, body: AsyncIterator[by
     """
     ending = Path(file_name).suffix.lower()
     if not _ENDING.fullmatch(ending):
-        raise InputError(file_name[:80], f"the ending {ending!r}", "the ending of a table or a workbook")
+        problem = f"{ending!r} is no ending of a table or a workbook"
+        raise InputError(file_name[:80], problem, "rename the file, or export it in another format")
     folder = recordings.new(file_name)
     try:
         await _write(folder.path / _PARTIAL, file_name, body)
@@ -46,8 +47,8 @@ async def _write(partial: Path, file_name: str, body: AsyncIterator[bytes]) -> N
             async for part in body:
                 size += len(part)
                 if size > MOST_BYTES:
-                    found = f"more than {MOST_BYTES // 10**6} MB"
-                    raise InputError(file_name[:80], found, "a file with one recording")
+                    problem = f"the file has more than {MOST_BYTES // 10**6} MB"
+                    raise InputError(file_name[:80], problem, "drop the file of a single recording")
                 handle.write(part)
     except OSError as error:
         raise CannotWrite(file_name[:80], error) from None

@@ -39,7 +39,7 @@ def app(folder: Path, port: int, as_json: bool) -> None:
         if error.name not in ("starlette", "uvicorn"):
             raise
         raise InputError(
-            "app", f"no {error.name} installed", "the packages of `pip install '.[app]'`"
+            "app", f"the package {error.name} is not installed", "run `pip install '.[app]'`"
         ) from None
     page = open_page(folder, port)
     print_answer(page.answer, as_json)

@@ -68,7 +68,11 @@ def _units(texts: Sequence[str]) -> Mapping[str, Any]:
     for text in texts:
         quantity, equals, unit = text.partition("=")
         if not equals or quantity in units:
-            raise InputError(f"--unit {text}", repr(text), "QUANTITY=UNIT, once for a quantity")
+            raise InputError(
+                f"--unit {text}",
+                f"{quantity} has another unit already" if equals else "it states no unit",
+                "write --unit QUANTITY=UNIT, once for each quantity",
+            )
         units[quantity] = stated_unit(quantity, unit)
     return units
 
