@@ -95,6 +95,11 @@ def test_what_is_no_recording_is_refused_in_the_line_of_the_command_and_not_kept
     assert sorted(owner.page.folder.iterdir()) == before
 
 
+def test_a_refused_file_can_be_mended_and_dropped_again(owner: Visitor) -> None:
+    assert owner.drop("mended.csv", b"no table\n").status == 400
+    assert "2: pull" in owner.ask("GET", dropped(owner, "mended.csv", BARE)).text
+
+
 def test_a_file_that_is_too_large_is_refused_while_it_arrives(
     owner: Visitor, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -99,8 +99,9 @@ def start(folder: Path, question: str, commands: Sequence[Sequence[str]]) -> Non
             raise InputError(folder.parent.name, "a job runs already", "stop it first, or wait for its end")
         for name in (END, PROGRESS):
             (folder / name).unlink(missing_ok=True)
-        write_json(folder / REQUEST, {"question": question, "commands": commands, "started_s": time.time()})
         with open(folder / OUTPUT, "wb") as output:
+            request = {"question": question, "commands": commands, "started_s": time.time()}
+            write_json(folder / REQUEST, request)
             process = subprocess.Popen(
                 [sys.executable, "-m", "bayeskin.app.supervisor", str(folder), str(lock.fileno())],
                 cwd=folder.parent, start_new_session=True, pass_fds=(lock.fileno(),),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from bayeskin import storage
@@ -107,8 +109,15 @@ def reading_of(folder: RecordingFolder) -> Reading:
 
 def beginnings(folder: RecordingFolder) -> tuple[SheetPreview, ...]:
     """Returns the first rows of each sheet of the original, and () where none can be shown."""
+    original = folder.original
+    return _beginnings(original, original.stat().st_mtime_ns) if original else ()
+
+
+@lru_cache(maxsize=64)
+def _beginnings(original: Path, written_ns: int) -> tuple[SheetPreview, ...]:
+    """Returns the first rows of a file as it was written at a time, so that it is read only once."""
     try:
-        return preview(folder.original) if folder.original else ()
+        return preview(original)
     except InputError:
         return ()
 
@@ -120,9 +129,15 @@ def can_be_corrected(folder: RecordingFolder) -> bool:
 
 def charts(folder: RecordingFolder, answer: Mapping[str, Any]) -> tuple[Chart, ...]:
     """Returns the charts of a recording as it was read; none for a recording that was never read."""
-    if not answer:
+    if not answer or not folder.stored.is_file():
         return ()
-    return recording_charts(storage.load(folder.stored, Recording), answer["phases"])
+    return _charts(folder.stored, folder.stored.stat().st_mtime_ns, json.dumps(answer["phases"]))
+
+
+@lru_cache(maxsize=16)
+def _charts(stored: Path, written_ns: int, phases: str) -> tuple[Chart, ...]:
+    """Returns the charts of a recording as it was written at a time, so that it is drawn only once."""
+    return recording_charts(storage.load(stored, Recording), json.loads(phases))
 
 
 def unit_options() -> dict[str, list[tuple[str, str]]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from bayeskin.app.estimate import seconds_left, usual_seconds
 from bayeskin.app.jobs import Job
@@ -69,7 +70,15 @@ def _step(
         return Step(stage.name, stage.does, "waiting", 0.0, usual_s)
     seconds = 0.0
     if record is not None and stands == "not finished":  # its record was written when it began
-        seconds = record.seconds + max(time.time() - (run.folder / stage.name / RECORD).stat().st_mtime, 0.0)
+        seconds = record.seconds + _age_s(run.folder / stage.name / RECORD)
     now_s = time.monotonic()
     tasks_left_s = [left_s for task in job.tasks if (left_s := task.left_s(now_s)) is not None]
     return Step(stage.name, stage.does, "working", seconds, seconds_left(seconds, usual_s, tasks_left_s))
+
+
+def _age_s(file: Path) -> float:
+    """Returns the seconds since a file was written, and 0 if it is just being replaced."""
+    try:
+        return max(time.time() - file.stat().st_mtime, 0.0)
+    except FileNotFoundError:
+        return 0.0
