@@ -1,4 +1,4 @@
-"""Writes the materials of both layers of the skin for FEBio.
+"""Writes materials for FEBio.
 
 FEBio's biphasic material has the same equations as the model of this package, apart from the compressibility
 of the fluid and of the grains, which FEBio does not know. Its solid `neo-Hookean` has the same strain energy.
@@ -9,33 +9,40 @@ Source: FEBio User's Manual 4, sections on the materials "biphasic", "neo-Hookea
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
-from bayeskin.finite_element.problem import Constants
 
-LAYERS = {"c": "cutis", "s": "subcutis"}  # by the letter that ends the names of their parameters
+@dataclass(frozen=True)
+class Biphasic:
+    """One biphasic material.
 
-
-def febio_materials(theta: Mapping[str, float], remark: str) -> bytes:
-    """Returns an FEBio file with the materials of both layers, in SI units.
-
-    theta : E_c, E_s [Pa], k_c, k_s [m^2]; remark : comment at the top of the file
+    solid_fraction : volume fraction of the solid; poisson_ratio : of the drained solid
+    permeability_m4_ns : hydraulic permeability [m^4/(N s)]
     """
-    spec, fixed = ET.Element("febio_spec", version="4.0"), Constants()
+
+    name: str
+    solid_fraction: float
+    young_pa: float
+    poisson_ratio: float
+    permeability_m4_ns: float
+
+
+def febio_file(materials: Sequence[Biphasic], remark: str) -> bytes:
+    """Returns an FEBio file with materials in SI units; remark : comment at the top of the file."""
+    spec = ET.Element("febio_spec", version="4.0")
     spec.append(ET.Comment(f" {remark.replace('--', '-')} "))
     ET.SubElement(spec, "Module", type="biphasic")
-    materials = ET.SubElement(spec, "Material")
-    for number, (letter, layer) in enumerate(LAYERS.items(), 1):
-        ratio = theta.get(f"nu_{letter}", getattr(fixed, f"nu_{letter}"))
-        porosity = getattr(fixed, f"porosity_{letter}")
-        material = ET.SubElement(materials, "material", id=str(number), name=layer, type="biphasic")
-        _value(material, "phi0", 1.0 - porosity)
+    section = ET.SubElement(spec, "Material")
+    for number, layer in enumerate(materials, 1):
+        material = ET.SubElement(section, "material", id=str(number), name=layer.name, type="biphasic")
+        _value(material, "phi0", layer.solid_fraction)
         solid = ET.SubElement(material, "solid", type="neo-Hookean")
-        _value(solid, "E", theta[f"E_{letter}"])
-        _value(solid, "v", ratio)
+        _value(solid, "E", layer.young_pa)
+        _value(solid, "v", layer.poisson_ratio)
         permeability = ET.SubElement(material, "permeability", type="perm-const-iso")
-        _value(permeability, "perm", theta[f"k_{letter}"] / fixed.viscosity_pa_s)
+        _value(permeability, "perm", layer.permeability_m4_ns)
     ET.indent(spec)
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(spec, encoding="utf-8") + b"\n"
 

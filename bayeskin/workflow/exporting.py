@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.external.febio import febio_materials
+from bayeskin.external.febio import Biphasic, febio_file
 from bayeskin.finite_element.problem import Constants
 from bayeskin.inference import draws_of, fitted_normal, load_inference_data
 from bayeskin.json_files import plain
@@ -22,6 +22,7 @@ from bayeskin.workflow.engine import Reporter, Run, open_run, standing
 from bayeskin.workflow.output_paths import check_ending
 from bayeskin.workflow.stages import doubts_of, stages_of
 
+LAYERS = (("cutis", "c"), ("subcutis", "s"))  # with the letters that end the names of their parameters
 LAYERS_NEED = ("E_c", "E_s", "k_c", "k_s")
 
 
@@ -35,8 +36,8 @@ def export(config: Path, out: Path, reporter: Reporter) -> dict[str, Any]:
     run = open_run(config, reporter)
     state = standing(run, stages_of(run.config))["sample"][0]
     if state != "done":
-        problem = f"the stage `sample` is {state}, so there is no posterior to export"
-        raise InputError(config, problem, f"use `bayeskin run {config}` first")
+        problem = f"the posterior is not up to date (sample: {state})"
+        raise InputError(config, problem, f"start `bayeskin run {config}` first")
     space, draws = draws_of(load_inference_data(run.at("sample", "posterior.nc")))
     doubts = doubts_of(run)
     contents, says = WRITERS[out.suffix](run, space, draws, doubts)
@@ -87,12 +88,22 @@ def _materials(run: Run, space: ParameterSpace, draws: Array, doubts: list[str])
     """
     missing = [name for name in LAYERS_NEED if name not in space.names]
     if missing:
-        problem = f"the run has no parameter {', '.join(missing)}"
-        raise InputError(run.config_path, problem, "FEBio's materials need the parameters of both layers")
+        remedy = "the materials need the parameters of both layers"
+        raise InputError(run.config_path, f"it has no parameter {', '.join(missing)}", remedy)
     theta = dict(zip(space.names, map(float, np.median(draws, axis=0)), strict=True))
     remark = f"Medians of the posterior of {run.config.name} by bayeskin, in SI units."
     remark += "".join(f" The posterior is not to be trusted: {doubt}" for doubt in doubts)
-    return febio_materials(theta, remark), "FEBio's materials of both layers, at the medians, in SI units"
+    contents = febio_file([_layer(theta, *layer) for layer in LAYERS], remark)
+    return contents, "FEBio's materials of both layers, at the medians, in SI units"
+
+
+def _layer(theta: Mapping[str, float], name: str, letter: str) -> Biphasic:
+    """Returns the material of a layer; letter : the letter that ends the names of its parameters."""
+    fixed = Constants()
+    poisson_ratio = theta.get(f"nu_{letter}", getattr(fixed, f"nu_{letter}"))
+    solid_fraction = 1.0 - getattr(fixed, f"porosity_{letter}")
+    permeability_m4_ns = theta[f"k_{letter}"] / fixed.viscosity_pa_s
+    return Biphasic(name, solid_fraction, theta[f"E_{letter}"], poisson_ratio, permeability_m4_ns)
 
 
 WRITERS: dict[str, Callable[[Run, ParameterSpace, Array, list[str]], tuple[bytes, str]]] = {
