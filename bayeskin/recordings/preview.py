@@ -13,9 +13,8 @@ from bayeskin.errors import InputError
 from bayeskin.probe import bytes_of
 from bayeskin.recordings.headers import is_rule, is_unit_row
 from bayeskin.recordings.numbers import is_number
-from bayeskin.recordings.read import _sheets as sheets_of_workbook
 from bayeskin.recordings.text import TEXT, Rows, header_cells, rows_of_text
-from bayeskin.recordings.workbooks import rows_of_array
+from bayeskin.recordings.workbooks import rows_of_array, sheets_of_workbook
 
 ABOVE, BELOW = 4, 5  # rows that are shown above and from the first row of numbers
 MOST_COLUMNS, LONGEST_CELL = 60, 80
