@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -112,6 +113,19 @@ def test_every_answer_forbids_what_it_does_not_need(owner: Visitor) -> None:
 
 def test_the_page_listens_on_loopback_only(page: Page) -> None:
     assert page.listening.getsockname()[0] == "127.0.0.1"
+
+
+def test_the_link_is_not_among_the_arguments_of_the_browser(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    for _ in range(2):
+        page.show()
+        file = page.folder / ".open.html"
+        assert opened.pop() == file.as_uri()
+        assert page.access.link in file.read_text()
+        assert file.stat().st_mode & 0o077 == 0
 
 
 def test_other_users_may_not_look_into_the_folders(page: Page) -> None:

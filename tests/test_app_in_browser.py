@@ -65,6 +65,13 @@ def at(browser: Browser) -> str:
 
 
 def drop(browser: Browser, file: Path) -> None:
+    """Drags a file onto the page and lets it go, as with the pointer."""
+    dragged = {"items": [], "files": [str(file)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        browser.tell("Input.dispatchDragEvent", type=kind, x=400, y=200, data=dragged)
+
+
+def choose(browser: Browser, file: Path) -> None:
     """Chooses a file, as in the dialog of the browser."""
     document = browser.tell("DOM.getDocument")["root"]["nodeId"]
     node = browser.tell("DOM.querySelector", nodeId=document, selector=".drop input")["nodeId"]
@@ -129,11 +136,20 @@ def test_from_a_dropped_file_to_the_report(entered: Browser, page: Page, measure
     assert entered.complaints == []
 
 
+def test_the_link_works_wherever_it_is_clicked(shown: Browser, page: Page, tmp_path: Path) -> None:
+    (tmp_path / "letter.html").write_text(f'<a href="{page.access.link}">the page</a>')
+    shown.tell("Page.navigate", url=(tmp_path / "letter.html").as_uri())
+    until(lambda: text(shown, "a") == "the page")
+    shown.click("a")
+    until(lambda: at(shown) == f"{page.access.root}/")
+    assert "Drop a recording here" in text(shown, "main")
+
+
 def test_a_broken_file_is_refused_on_the_page(entered: Browser, page: Page, tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("Dear reader,\nthis is no table.\n")
     entered.tell("Page.navigate", url=f"http://127.0.0.1:{page.access.port}{page.access.root}/")
     until(lambda: at(entered) == f"{page.access.root}/")
-    drop(entered, tmp_path / "letter.txt")
+    choose(entered, tmp_path / "letter.txt")
     until(lambda: "no rows of numbers" in text(entered, ".drop .problem"))
     entered.events.clear()  # the browser reports the refusal of the request, too
 

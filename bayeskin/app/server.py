@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import webbrowser
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +37,17 @@ class Page:
             f"The recordings lie in {self.folder}. Ctrl-C closes the page; jobs that run go on."
         )
         return {"ok": True, "link": self.access.link, "folder": str(self.folder), "text": text}
+
+    def show(self) -> None:
+        """Opens the page in the browser, by way of a file that only its owner can read.
+
+        Other users of the machine can see the arguments of a browser's process, so the link is not among them.
+        """
+        file = self.folder / ".open.html"
+        file.unlink(missing_ok=True)
+        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as handle:
+            handle.write(f'<meta http-equiv="refresh" content="0; url={self.access.link}">\n')
+        webbrowser.open(file.as_uri())
 
     def serve(self) -> None:
         """Answers requests until Ctrl-C."""

@@ -16,8 +16,9 @@ from bayeskin.errors import InputError
 @click.option(
     "--port", default=0, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
 )
+@click.option("--open", "opens", is_flag=True, help="Open the page in the browser, too.")
 @json_option
-def app(folder: Path, port: int, as_json: bool) -> None:
+def app(folder: Path, port: int, opens: bool, as_json: bool) -> None:
     """Open a page in the browser, for people who do not use a terminal.
 
     A recording is dropped on the page. The page shows how it was understood, asks for the device, starts a
@@ -31,6 +32,7 @@ def app(folder: Path, port: int, as_json: bool) -> None:
     \b
     Example:
       bayeskin app
+      bayeskin app --open
       bayeskin app arms --port 8080
     """
     try:
@@ -43,4 +45,6 @@ def app(folder: Path, port: int, as_json: bool) -> None:
         ) from None
     page = open_page(folder, port)
     print_answer(page.answer, as_json)
+    if opens:
+        page.show()
     page.serve()
