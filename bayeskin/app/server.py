@@ -41,7 +41,7 @@ class Page:
     def show(self) -> None:
         """Opens the page in the browser, by way of a file that only its owner can read.
 
-        Other users of the machine can see the arguments of a browser's process, so the link is not among them.
+        Other users of the machine can see the arguments of a process, so the link is not among them.
         """
         file = self.folder / ".open.html"
         file.unlink(missing_ok=True)
