@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +16,21 @@ from toys.small_study import record
 
 from bayeskin.app import jobs
 from bayeskin.app.comparison import RunAnswer, by_parameter, table
+from bayeskin.app.devices import state
 from bayeskin.app.estimate import OVERRUN, SHIPPED_DESIGN_S, USUAL_S, seconds_left, usual_seconds
 from bayeskin.app.jobs import Job, State
-from bayeskin.app.questions import CALIBRATE
+from bayeskin.app.questions import CALIBRATE, ask
 from bayeskin.app.recordings import RecordingFolder
 from bayeskin.app.steps import steps
 from bayeskin.config import config_of
+from bayeskin.config.device import DeviceFile
 from bayeskin.report.page.answer import answer
+from bayeskin.shipped import shipped
 from bayeskin.workflow.engine import Silent, open_run, run_stages
 from bayeskin.workflow.folder import Record, write_record
 from bayeskin.workflow.stages import stages_of
 
+REDUCED, NEW = shipped("surrogates/article-device-reduced.h5"), "device-reduced.h5"
 CONFIG = """
 [recording]
 file = "a.h5"
@@ -137,6 +142,29 @@ def test_a_step_that_works_counts_the_time_since_it_began(spring: RecordingFolde
     assert working.state == "working"
     assert working.seconds == pytest.approx(100.0, abs=10.0)
     assert working.left_s == pytest.approx(OVERRUN * working.seconds)
+
+
+def test_a_configuration_is_written_anew_only_if_what_it_is_made_of_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+    monkeypatch.setattr(jobs, "start", lambda folder, question, commands: asked.extend(commands))
+    folder = RecordingFolder(tmp_path / "arm")
+    folder.path.mkdir()
+    shutil.copy(shipped("data/demo.h5"), folder.stored)
+    state(folder, DeviceFile())
+    ask(folder, "missing")
+    assert asked == [["diagnose", "arm.toml"], ["report", "arm.toml"]]
+    own = folder.config.read_text() + "# my own\n"
+    folder.config.write_text(own)
+    ask(folder, "calibrate")
+    assert folder.config.read_text() == own
+    for change in (lambda: state(folder, DeviceFile()), lambda: shutil.copyfile(REDUCED, folder.path / NEW)):
+        time.sleep(0.02)
+        change()
+        ask(folder, "calibrate")
+        assert "# my own" not in folder.config.read_text()
+        folder.config.write_text(own)
 
 
 @pytest.mark.slow

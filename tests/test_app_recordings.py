@@ -68,6 +68,7 @@ def test_a_sound_file_is_read_at_once(owner: Visitor, measured: Path) -> None:
     shown = owner.ask("GET", at).text
     assert "2: displacement (mm)" in shown
     assert "All 9 phases" in shown
+    assert "<li>column &#39;force (N)&#39; read as force in N</li>" in shown
     assert 'class="phase hold"' in shown
     assert (owner.page.folder / "sound/sound.h5").is_file()
 

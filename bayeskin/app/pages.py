@@ -19,7 +19,7 @@ from bayeskin.app.steps import steps
 from bayeskin.app.uploads import MOST_BYTES
 from bayeskin.errors import InputError
 from bayeskin.number_format import number, percent
-from bayeskin.report.page.parts import Cell, Facts, Folded, Table, row
+from bayeskin.report.page.parts import Cell, Facts, Folded, Table, Text, row
 from bayeskin.report.page.render import page_environment
 from bayeskin.workflow.progress import TaskProgress
 
@@ -65,7 +65,7 @@ def recording_page(
               if other != folder and other.device.is_file()]  # fmt: skip
     return render(
         "recording.html", root, folder=folder, reading=read, choice=read.choice, problems=problems,
-        facts=_facts(read.answer), phases=_phases(read.answer), charts=reading.charts(folder, read.answer),
+        facts=_facts(read.answer), details=_details(read.answer), charts=reading.charts(folder, read.answer),
         sheets=sheets, columns=_columns(sheets), units=reading.unit_options(),
         stated=stated, fields=devices.fields_of(device), others=others,
         job=job, titles=_TITLES, questions=_questions(folder, stated),
@@ -113,8 +113,8 @@ def _facts(answer: Mapping[str, Any]) -> Facts:
     ))  # fmt: skip
 
 
-def _phases(answer: Mapping[str, Any]) -> Folded:
-    """Returns the table of the phases and the notes on how the file was read, folded away."""
+def _details(answer: Mapping[str, Any]) -> list[Folded]:
+    """Returns the table of the phases, and the notes on how the file was read, both folded away."""
     rows = [
         row((
             phase["kind"], _cell(phase["cycle"]), _cell(phase["start_s"]), _cell(phase["end_s"]),
@@ -124,7 +124,11 @@ def _phases(answer: Mapping[str, Any]) -> Folded:
         for phase in answer.get("phases", ())
     ]  # fmt: skip
     head = ("phase", "cycle", "from [s]", "to [s]", "from [mm]", "to [mm]", "noise [mN]", "spikes", "steps")
-    return Folded(f"All {len(rows)} phases", (Table("Phases", head, rows),))
+    notes = answer.get("notes", ())
+    details = [Folded(f"All {len(rows)} phases", (Table("Phases", head, rows),))]
+    return details + (
+        [Folded("Notes on how the file was read", (Text(notes, listed=True),))] if notes else []
+    )
 
 
 def _cell(value: float, digits: int = 4) -> Cell:

@@ -9,6 +9,7 @@ from bayeskin.app import jobs
 from bayeskin.app.recordings import RecordingFolder
 from bayeskin.errors import InputError
 from bayeskin.workflow.new import new_config
+from bayeskin.workflow.reducing import default_path
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,9 @@ QUESTIONS = {question.key: question for question in (CALIBRATE, MISSING, PREPARE
 def ask(folder: RecordingFolder, key: str) -> None:
     """Starts, or continues, the job that answers a question about a recording.
 
-    The configuration is written anew if the recording or its device was changed since. Raises InputError if
-    a job of this recording runs already, or if the recording or its device cannot be used.
+    The configuration is written anew if the recording, its device or the device's reduced model was changed
+    since. Raises InputError if a job of this recording runs already, or if the recording or its device cannot
+    be used.
     """
     if key not in QUESTIONS:
         raise InputError("question", f"{key!r} is not known", f"ask one of {', '.join(QUESTIONS)}")
@@ -58,7 +60,8 @@ def ask(folder: RecordingFolder, key: str) -> None:
     if not folder.device.is_file():
         raise InputError(folder.name, "the device is not stated", "state it first")
     refuse_running(folder)
-    changed_s = max(folder.stored.stat().st_mtime, folder.device.stat().st_mtime)
+    inputs = (folder.stored, folder.device, default_path(folder.device))
+    changed_s = max(file.stat().st_mtime for file in inputs if file.is_file())
     if not folder.config.is_file() or folder.config.stat().st_mtime < changed_s:
         folder.config.unlink(missing_ok=True)
         new_config([folder.stored], folder.config, folder.device)
