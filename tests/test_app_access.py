@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from toys.app_page import Visitor, served
+from toys.command_line import Command, assert_refused
 
 from bayeskin.app.server import Page
 
@@ -131,3 +133,17 @@ def test_the_link_is_not_among_the_arguments_of_the_browser(
 def test_other_users_may_not_look_into_the_folders(page: Page) -> None:
     assert page.folder.stat().st_mode & 0o077 == 0
     assert (page.folder / "arm").stat().st_mode & 0o077 == 0
+
+
+def test_without_its_packages_or_its_port_the_command_ends_with_one_line(
+    bayeskin: Command, page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = bayeskin("app", tmp_path / "recordings", "--port", page.access.port)
+    assert_refused(taken, f"127.0.0.1:{page.access.port}: the page cannot listen there", "use a free port")
+    (tmp_path / "file").touch()
+    assert_refused(bayeskin("app", tmp_path / "file"), "the folder cannot be made")
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    monkeypatch.delitem(sys.modules, "bayeskin.app.server")
+    answer = bayeskin("app", tmp_path / "other")
+    assert_refused(answer, "app: the package uvicorn is not installed; run `pip install '.[app]'`")
+    assert not (tmp_path / "other").exists()
