@@ -15,7 +15,7 @@ from toys.finished_run import facts
 from toys.small_study import record
 
 from bayeskin.app import jobs
-from bayeskin.app.comparison import RunAnswer, by_parameter, table
+from bayeskin.app.comparison import RunAnswer, by_parameter, run_answer, table
 from bayeskin.app.devices import state
 from bayeskin.app.estimate import OVERRUN, SHIPPED_DESIGN_S, USUAL_S, seconds_left, usual_seconds
 from bayeskin.app.jobs import Job, State
@@ -24,7 +24,6 @@ from bayeskin.app.recordings import RecordingFolder
 from bayeskin.app.steps import steps
 from bayeskin.config import config_of
 from bayeskin.config.device import DeviceFile
-from bayeskin.report.page.answer import answer
 from bayeskin.shipped import shipped
 from bayeskin.workflow.engine import Silent, open_run, run_stages
 from bayeskin.workflow.folder import Record, write_record
@@ -56,9 +55,10 @@ evaluations = 500
 
 
 def test_runs_are_compared_parameter_by_parameter() -> None:
-    said = answer(facts())
+    run = run_answer("left", facts())
+    said = run.answer
     without = replace(said, parameters=[one for one in said.parameters if one.name != "p_init"])
-    runs = [RunAnswer("left", said), RunAnswer("right", without)]
+    runs = [run, RunAnswer("right", without)]
     parameters = by_parameter(runs)
     assert [(one.name, [name for name, _ in one.runs]) for one in parameters] == [
         ("E_c", ["left", "right"]),
@@ -68,7 +68,9 @@ def test_runs_are_compared_parameter_by_parameter() -> None:
     assert [row[0] for row in rows] == ["left", "right"]
     assert rows[0][1] == f"{said.parameters[0].median} ({said.parameters[0].interval})"
     assert rows[1][2] == "–"
-    assert rows[0][-2:] == [said.sure.word, said.missing.word]
+    assert rows[0][-2:] == ["trusted", "device-friction"]
+    assert rows[1][-1] == said.missing.word
+    assert said.missing.command == ""
 
 
 def test_a_stage_takes_as_long_as_in_finished_runs_of_other_recordings(tmp_path: Path) -> None:

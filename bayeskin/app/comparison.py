@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from bayeskin.app.recordings import RecordingFolder
 from bayeskin.errors import InputError
 from bayeskin.report.page.answer import answer
-from bayeskin.report.page.parts import Answer, ParameterSummary, Table, row
+from bayeskin.report.page.facts import RunFacts
+from bayeskin.report.page.parts import Answer, Cell, ParameterSummary, Table, row
 from bayeskin.workflow.engine import Silent, open_run
 from bayeskin.workflow.page import facts_of
 from bayeskin.workflow.stages import stages_of
@@ -16,10 +17,14 @@ from bayeskin.workflow.stages import stages_of
 
 @dataclass(frozen=True)
 class RunAnswer:
-    """The answer of one run, with the name of its recording."""
+    """The answer of one run, with the name of its recording.
+
+    mechanisms : names of the mechanisms that the diagnosis has named
+    """
 
     name: str
     answer: Answer
+    mechanisms: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -31,26 +36,28 @@ class ParameterOfRuns:
     runs: Sequence[tuple[str, ParameterSummary]]
 
 
-def answer_of(folder: RecordingFolder) -> Answer | None:
-    """Returns the answer of a recording's run as far as it is finished, or None where no run was started.
+def run_answer(name: str, facts: RunFacts) -> RunAnswer:
+    """Returns the answer of a run; it names no commands, since the page has buttons."""
+    said = answer(facts)
+    parts = {part: replace(getattr(said, part), command="") for part in ("material", "sure", "missing")}
+    mechanisms = [mechanism["name"] for mechanism in facts.said("diagnose").get("mechanisms", ())]
+    return RunAnswer(name, replace(said, **parts), mechanisms)
 
-    It names no commands, since the page has buttons.
-    """
+
+def answer_of(folder: RecordingFolder) -> RunAnswer | None:
+    """Returns the answer of a recording's run as far as it is finished, or None where no run was started."""
     if not folder.config.is_file():
         return None
     try:
         run = open_run(folder.config, Silent())
-        said = answer(facts_of(run, stages_of(run.config)))
+        return run_answer(folder.name, facts_of(run, stages_of(run.config)))
     except (InputError, OSError):  # a job that runs may just replace a file
         return None
-    parts = {part: replace(getattr(said, part), command="") for part in ("material", "sure", "missing")}
-    return replace(said, **parts)
 
 
 def answered(folders: Sequence[RecordingFolder]) -> list[RunAnswer]:
     """Returns the answers of the recordings whose run has been started."""
-    answers = ((folder.name, answer_of(folder)) for folder in folders)
-    return [RunAnswer(name, said) for name, said in answers if said is not None]
+    return [run for run in map(answer_of, folders) if run is not None]
 
 
 def by_parameter(runs: Sequence[RunAnswer]) -> list[ParameterOfRuns]:
@@ -70,5 +77,7 @@ def table(runs: Sequence[RunAnswer], parameters: Sequence[ParameterOfRuns]) -> T
     for run in runs:
         known = {summary.name: f"{summary.median} ({summary.interval})" for summary in run.answer.parameters}
         values = [known.get(parameter.name, "–") for parameter in parameters]
-        rows.append(row((run.name, *values, run.answer.sure.word, run.answer.missing.word)))
+        missing = ", ".join(run.mechanisms) or run.answer.missing.word
+        name = Cell(run.name, href=f"recordings/{run.name}")
+        rows.append(row((name, *values, run.answer.sure.word, missing)))
     return Table("Posterior medians with 90 % intervals", head, rows)

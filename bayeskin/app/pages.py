@@ -60,7 +60,7 @@ def recording_page(
     except InputError as error:
         device, problems["device"] = devices.DeviceFile(), str(error)
     stated = folder.device.is_file() and not problems["device"]
-    sheets = reading.beginnings(folder)
+    sheets, run = reading.beginnings(folder), comparison.answer_of(folder)
     others = [(other.name, other.name) for other in recordings.all()
               if other != folder and other.device.is_file()]  # fmt: skip
     return render(
@@ -70,7 +70,7 @@ def recording_page(
         stated=stated, fields=devices.fields_of(device), others=others,
         job=job, titles=_TITLES, questions=_questions(folder, stated),
         ready=bool(read.answer) and stated and not (job and job.running),
-        answer=comparison.answer_of(folder),
+        answer=run and run.answer,
     )  # fmt: skip
 
 
