@@ -181,6 +181,7 @@ STAGE = Stage(
     ("seed", "model", "parameters", "noise"),
     _work,
     _files,
+    format=2,
 )
 
 
