@@ -6,10 +6,20 @@ The functions in `__all__` are for scripts; the command line is in `bayeskin.cli
 
 from __future__ import annotations
 
+import os
+import sys
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from bayeskin.compiled_code import keep_compiled_code
 
 if TYPE_CHECKING:
     from bayeskin.scripting import calibrate, check, diagnose, load_recording, simulate
+
+_home, _temporary = Path(os.path.expanduser("~")), Path(tempfile.gettempdir())
+if _folder := keep_compiled_code(Path(__file__).parent, _home, _temporary):
+    print(f"bayeskin: compiled code is kept in {_folder}; no usual folder is writable", file=sys.stderr)
 
 __version__ = "0.1.0"
 __all__ = ["calibrate", "check", "diagnose", "load_recording", "simulate"]

@@ -26,6 +26,7 @@ BASE = {
 }
 SIBLINGS = {"recordings", "finite_element", "design", "surrogates"}
 BELOW = {
+    "compiled_code": set(),
     "errors": set(),
     "json_files": set(),
     "hashing": {"json_files"},
