@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from toys import stand_in_model
 from toys.closed_form_model import MOTION, SPACE, toy_force
+from toys.coarse_proposals import propose_coarsely
 
 from bayeskin import inference, report, storage
 from bayeskin.design_files import load_design
-from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data, proposal
+from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
 from bayeskin.number_format import interval
 from bayeskin.report.page.prose import prose
 from bayeskin.types import Design, PadMotion, Recording, Simulation
@@ -47,8 +48,8 @@ effective_samples = 100
 [check]
 draws = 8
 [map]
-starts = 2
-evaluations = 1000
+starts = 1
+evaluations = 400
 [sobol]
 samples = 64
 """
@@ -74,7 +75,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
-        patch.setattr(proposal, "MIXTURE", dataclasses.replace(proposal.MIXTURE, components=4, rounds=2))
+        propose_coarsely(patch)
         patch.setattr(inference, "profiles", partial(inference.profiles, points=3))
         patch.setattr(model, "FullModel", stand_in_model.ToyModel)
         patch.setattr(maximum, "simulate", interrupted)
@@ -262,7 +263,7 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
-    monkeypatch.setattr(proposal, "MIXTURE", dataclasses.replace(proposal.MIXTURE, components=4, rounds=2))
+    propose_coarsely(monkeypatch)
     monkeypatch.setattr(inference, "profiles", partial(inference.profiles, points=3))
     monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
     chains = list((folder / "case" / "chains").iterdir())
