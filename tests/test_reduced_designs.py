@@ -17,12 +17,13 @@ from toys.small_reduced import hollow
 
 from bayeskin import cli, report, storage
 from bayeskin.config import load_config
+from bayeskin.execution.local import here
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward import design_model
 from bayeskin.forward.design_model import FullModel, ReducedOrFull
 from bayeskin.geometry import Geometry
 from bayeskin.types import BinnedForce, Design, PadMotion, Recording, Simulation
-from bayeskin.workflow import maximum, model, reducing, stages
+from bayeskin.workflow import executor, maximum, model, reducing, stages
 from bayeskin.workflow.engine import Silent, open_run, standing
 from bayeskin.workflow.model import full_model, waves_model
 from bayeskin.workflow.new import new_config
@@ -95,6 +96,7 @@ def test_a_run_with_a_reduced_design_is_corrected_by_the_full_model(
     monkeypatch.setattr(report, "save_figure", lambda figure, stem, provenance: None)
     propose_coarsely(monkeypatch)
     monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
+    monkeypatch.setattr(executor, "local", lambda workers: here)  # starts no process
     monkeypatch.setattr(model, "ReducedOrFull", ToyReduced)
     monkeypatch.setattr(maximum, "simulate", stand_in_model.simulate)
     stages.run(case, "map", Silent())

@@ -19,11 +19,12 @@ from toys.coarse_proposals import propose_coarsely
 
 from bayeskin import inference, report, storage
 from bayeskin.design_files import load_design
+from bayeskin.execution.local import here
 from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
 from bayeskin.number_format import interval
 from bayeskin.report.page.prose import prose
 from bayeskin.types import Design, PadMotion, Recording, Simulation
-from bayeskin.workflow import maximum, model, stages, waves
+from bayeskin.workflow import executor, maximum, model, stages, waves
 from bayeskin.workflow.calibration import refined_posterior
 from bayeskin.workflow.checking import checked_posterior, with_full_model
 from bayeskin.workflow.engine import Silent, open_run
@@ -78,6 +79,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         propose_coarsely(patch)
         patch.setattr(inference, "profiles", partial(inference.profiles, points=3))
         patch.setattr(model, "FullModel", stand_in_model.ToyModel)
+        patch.setattr(executor, "local", lambda workers: here)  # starts no process
         patch.setattr(maximum, "simulate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             stages.run(where / "case.toml", None, Silent())
@@ -229,6 +231,7 @@ def test_draws_join_the_design_where_the_full_model_is_elsewhere(
     problem, asked = refined_posterior(run), []
     theta = run.summary("map")["theta"]
     monkeypatch.setattr(model, "FullModel", partial(Steeper, about_pa=theta["E_c"], power=power))
+    monkeypatch.setattr(executor, "local", lambda workers: here)
     large = {
         name: 0.05 for name in problem.names if name.startswith("sd_")
     }  # beside the toy surrogate's error
@@ -266,6 +269,7 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     propose_coarsely(monkeypatch)
     monkeypatch.setattr(inference, "profiles", partial(inference.profiles, points=3))
     monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
+    monkeypatch.setattr(executor, "local", lambda workers: here)  # starts no process
     chains = list((folder / "case" / "chains").iterdir())
     (folder / "case.toml").write_text(CONFIG.format(steps=600))
     answer = stages.run(folder / "case.toml", "sample", Silent())
