@@ -20,7 +20,7 @@ from bayeskin.json_files import plain
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 
-@lru_cache(maxsize=8)  # each run of a forward model of the user's own needs this hash
+@lru_cache(maxsize=1024)  # the hash of all of a diagnosis's sources is needed again and again
 def sha256_of_behaviour(source: bytes) -> str:
     """Returns the sha256 of a Python source's syntax tree without docstrings.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import arviz as az
@@ -10,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
 from toys import inference_problems
+from toys.coarse_proposals import propose_coarsely
 
 from bayeskin.finite_element import ModelSpec
-from bayeskin.inference import NoisePriors, proposal
+from bayeskin.inference import NoisePriors
 from bayeskin.recordings import read_recording
 from bayeskin.shipped import shipped
 from bayeskin.types import Recording
@@ -41,7 +41,7 @@ def test_ranks_and_intervals_are_those_of_the_draws(benchmark):
 
 
 def test_a_recording_is_made_inferred_and_ranked_in_one_row(benchmark, monkeypatch):
-    monkeypatch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
+    propose_coarsely(monkeypatch)
     calibration = benchmark("calibration")
     settings = calibration.SampleSettings(2, 24, 500, calibration.Limits())
     item = {"surrogate": calibration.surrogate_hash(), "data": "surrogate", "seed": 1, "index": 3}

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from toys import banana
+from toys.coarse_proposals import propose_coarsely
 from toys.inference_problems import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
 from bayeskin.errors import InputError
@@ -38,7 +39,15 @@ LONGER = SampleSettings(2, 16, 750, Limits(effective_samples=1e9))
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Posterior]:
     """Chains on a line that were sampled at one go, with what they gave."""
     folder = tmp_path_factory.mktemp("whole")
-    return folder, sample(line_problem(), folder, 7, LINE_START, LONGER)
+    with pytest.MonkeyPatch.context() as patch:
+        propose_coarsely(patch)
+        return folder, sample(line_problem(), folder, 7, LINE_START, LONGER)
+
+
+@pytest.fixture
+def coarsely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets the sampler propose as in the chains above."""
+    propose_coarsely(monkeypatch)
 
 
 @pytest.fixture
@@ -108,6 +117,7 @@ def test_data_of_one_hold_cover_the_truth_and_leave_p_init_alone(tmp_path: Path)
     assert learned.contraction > 0.5
 
 
+@pytest.mark.usefixtures("coarsely")
 def test_a_run_in_two_parts_is_the_run_in_one(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
     problem = line_problem()
     sample(problem, tmp_path / "two", 7, LINE_START, SHORT)
@@ -120,6 +130,7 @@ def test_a_run_in_two_parts_is_the_run_in_one(whole: tuple[Path, Posterior], tmp
     assert not np.array_equal(load_chains(tmp_path / "three", problem, 1), chains[:1, :500])
 
 
+@pytest.mark.usefixtures("coarsely")
 def test_chains_of_more_ensembles_than_are_asked_for_are_left_alone(chains: Path) -> None:
     problem = line_problem()
     before = (chains / "ensemble_1.h5").read_bytes()
@@ -129,11 +140,13 @@ def test_chains_of_more_ensembles_than_are_asked_for_are_left_alone(chains: Path
     assert (chains / "ensemble_1.h5").read_bytes() == before
 
 
+@pytest.mark.usefixtures("coarsely")
 def test_threads_change_nothing(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
     together = sample(line_problem(), tmp_path, 7, LINE_START, LONGER, threads=2)
     assert np.array_equal(whole[1].draws, together.draws)
 
 
+@pytest.mark.usefixtures("coarsely")
 def test_an_error_in_a_thread_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log_prob = LogPosterior.log_prob
 
@@ -147,6 +160,7 @@ def test_an_error_in_a_thread_is_not_lost(tmp_path: Path, monkeypatch: pytest.Mo
         sample(line_problem(), tmp_path, 7, LINE_START, SampleSettings(2, 16, 600), threads=2)
 
 
+@pytest.mark.usefixtures("coarsely")
 def test_an_interrupted_run_goes_on_bit_for_bit(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
     problem = line_problem()
 
@@ -166,15 +180,19 @@ def test_an_interrupted_run_goes_on_bit_for_bit(whole: tuple[Path, Posterior], t
 
 KILLED = """
 import sys
+import pytest
+from toys.coarse_proposals import propose_coarsely
 from toys.inference_problems import line_problem
 from bayeskin.inference import Limits, SampleSettings, sample
 from bayeskin.types import Array
 start = {start!r}
+propose_coarsely(pytest.MonkeyPatch())
 sample(line_problem(), sys.argv[1], 7, start, SampleSettings(2, 16, 100000, Limits(effective_samples=1e9)))
 """
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarsely")
 def test_a_killed_process_leaves_chains_that_go_on(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     code = KILLED.format(start=LINE_START)

@@ -28,6 +28,7 @@ from bayeskin.mechanisms.series import mean_beyond
 from bayeskin.mechanisms.slow_recovery import KelvinVoigt
 from bayeskin.types import PadMotion
 
+COARSE = ModelSpec(refinement=0)
 SHORT = PadMotion(np.array([0.0, 6.0, 12.0, 18.0]), 1e-3 * np.array([0.0, 6.0, 6.0, 0.0]))
 
 
@@ -38,7 +39,7 @@ def problem():
 
 @pytest.fixture(scope="module")
 def base():
-    return simulate(ModelSpec(), SHORT, THETA)
+    return simulate(COARSE, SHORT, THETA)
 
 
 def test_a_step_stretch_relaxes_by_the_branches_exponentials():
@@ -250,7 +251,7 @@ def test_the_element_under_a_constant_force_creeps_by_its_exponential():
 
 @pytest.mark.parametrize("name", sorted(SOLVED))
 def test_a_neutral_mechanism_gives_the_base_models_run(base, name):
-    simulation = simulate(ModelSpec(), SHORT, THETA | SOLVED[name].neutral, laws=laws([SOLVED[name]]))
+    simulation = simulate(COARSE, SHORT, THETA | SOLVED[name].neutral, laws=laws([SOLVED[name]]))
     assert simulation.status == "ok"
     np.testing.assert_allclose(simulation.at(base.time_s), base.force_n, atol=1e-4 * base.force_n.max())
 
@@ -259,7 +260,7 @@ def test_a_neutral_mechanism_gives_the_base_models_run(base, name):
 def test_a_shortcut_is_near_the_full_model(base, name):
     """RMS within a tenth of the effect."""
     mechanism = SOLVED[name]
-    simulation = simulate(ModelSpec(), SHORT, strong(mechanism.name), laws=laws([mechanism]))
+    simulation = simulate(COARSE, SHORT, strong(mechanism.name), laws=laws([mechanism]))
     columns = {key: np.array([value]) for key, value in STRONG.items()}
     times = np.arange(0.0, 18.0, 0.2)
     quick = observed([mechanism], columns, SHORT, lambda t: np.atleast_2d(base.at(t)))(times)[0]

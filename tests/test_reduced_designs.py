@@ -12,17 +12,18 @@ import numpy as np
 import pytest
 from toys import stand_in_model
 from toys.closed_form_model import MOTION, toy_force
+from toys.coarse_proposals import propose_coarsely
 from toys.small_reduced import hollow
 
 from bayeskin import cli, report, storage
 from bayeskin.config import load_config
+from bayeskin.execution.local import here
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward import design_model
 from bayeskin.forward.design_model import FullModel, ReducedOrFull
 from bayeskin.geometry import Geometry
-from bayeskin.inference import proposal
 from bayeskin.types import BinnedForce, Design, PadMotion, Recording, Simulation
-from bayeskin.workflow import maximum, model, reducing, stages
+from bayeskin.workflow import executor, maximum, model, reducing, stages
 from bayeskin.workflow.engine import Silent, open_run, standing
 from bayeskin.workflow.model import full_model, waves_model
 from bayeskin.workflow.new import new_config
@@ -39,13 +40,13 @@ refinement = 3
 [fit]
 bin_width_s = 1.0
 [design]
-points = [24, 16, 16]
+points = [24, 12, 12]
 held_out = 8
 coarse = "reduced"
 workers = 1
 [map]
-starts = 2
-evaluations = 1000
+starts = 1
+evaluations = 400
 """
 
 
@@ -93,8 +94,9 @@ def test_a_run_with_a_reduced_design_is_corrected_by_the_full_model(
 ) -> None:
     case = measured(tmp_path)
     monkeypatch.setattr(report, "save_figure", lambda figure, stem, provenance: None)
-    monkeypatch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
+    propose_coarsely(monkeypatch)
     monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
+    monkeypatch.setattr(executor, "local", lambda workers: here)  # starts no process
     monkeypatch.setattr(model, "ReducedOrFull", ToyReduced)
     monkeypatch.setattr(maximum, "simulate", stand_in_model.simulate)
     stages.run(case, "map", Silent())

@@ -16,15 +16,17 @@ import numpy as np
 import pytest
 from toys import stand_in_model
 from toys.closed_form_model import MOTION, SPACE, toy_force
+from toys.coarse_proposals import propose_coarsely
 
 from bayeskin import inference, report, storage
 from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
-from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data, proposal
+from bayeskin.execution.local import here
+from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
 from bayeskin.number_format import interval
 from bayeskin.report.page.prose import prose
 from bayeskin.types import Design, PadMotion, Recording, Simulation
-from bayeskin.workflow import maximum, model, stages, waves
+from bayeskin.workflow import executor, maximum, model, stages, waves
 from bayeskin.workflow.calibration import refined_posterior
 from bayeskin.workflow.checking import checked_posterior, with_full_model
 from bayeskin.workflow.engine import Silent, open_run
@@ -50,8 +52,8 @@ effective_samples = 100
 [check]
 draws = 8
 [map]
-starts = 2
-evaluations = 1000
+starts = 1
+evaluations = 400
 [sobol]
 samples = 64
 """
@@ -77,9 +79,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
-        patch.setattr(proposal, "MIXTURE", dataclasses.replace(proposal.MIXTURE, components=4, rounds=2))
+        propose_coarsely(patch)
         patch.setattr(inference, "profiles", partial(inference.profiles, points=3))
         patch.setattr(model, "FullModel", stand_in_model.ToyModel)
+        patch.setattr(executor, "local", lambda workers: here)  # starts no process
         patch.setattr(maximum, "simulate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             stages.run(where / "case.toml", None, Silent())
@@ -231,6 +234,7 @@ def test_draws_join_the_design_where_the_full_model_is_elsewhere(
     problem, asked = refined_posterior(run), []
     theta = run.summary("map")["theta"]
     monkeypatch.setattr(model, "FullModel", partial(Steeper, about_pa=theta["E_c"], power=power))
+    monkeypatch.setattr(executor, "local", lambda workers: here)
     large = {
         name: 0.05 for name in problem.names if name.startswith("sd_")
     }  # beside the toy surrogate's error
@@ -265,9 +269,10 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
-    monkeypatch.setattr(proposal, "MIXTURE", dataclasses.replace(proposal.MIXTURE, components=4, rounds=2))
+    propose_coarsely(monkeypatch)
     monkeypatch.setattr(inference, "profiles", partial(inference.profiles, points=3))
     monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
+    monkeypatch.setattr(executor, "local", lambda workers: here)  # starts no process
     chains = list((folder / "case" / "chains").iterdir())
     (folder / "case.toml").write_text(CONFIG.format(steps=600))
     answer = stages.run(folder / "case.toml", "sample", Silent())

@@ -15,13 +15,14 @@ import arviz as az
 import matplotlib as mpl
 import numpy as np
 import pytest
+from toys.coarse_proposals import propose_coarsely
 
 import bayeskin as bk
 from bayeskin import scripting
 from bayeskin.config import config_of, load_config, to_toml
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec, simulate
-from bayeskin.inference import draws_of, proposal
+from bayeskin.inference import draws_of
 from bayeskin.types import PadMotion, Recording, Simulation
 from bayeskin.workflow import diagnosis
 
@@ -43,7 +44,7 @@ def said() -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         patch.setattr(scripting, "run_model", coarsely)
-        patch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
+        propose_coarsely(patch)
         for block in BLOCKS:
             exec(compile(block, "docs/scripting.md", "exec"), names)
     return names
@@ -110,7 +111,7 @@ def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The settings contain numbers of NumPy."""
-    monkeypatch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
+    propose_coarsely(monkeypatch)
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     small = {
         "sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 500},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ COVERED = {
 }
 
 
+@cache
 def classes() -> dict[str, ast.ClassDef]:
     """Every class of these packages whose name ends in Settings, by its module and name."""
     return {

@@ -14,9 +14,10 @@ from toys.closed_form_model import EDGES_S, MOTION, SPACE, toy_bin_means, toy_fo
 from bayeskin import report, storage
 from bayeskin.design import fine_wave, first_wave, spread_out
 from bayeskin.errors import InputError
+from bayeskin.execution.local import here
 from bayeskin.surrogates import Similarity, correct, load_surrogate, save_surrogate, train
 from bayeskin.types import Design, Recording
-from bayeskin.workflow import maximum, model, stages
+from bayeskin.workflow import executor, maximum, model, stages
 from bayeskin.workflow.engine import Silent
 
 
@@ -159,6 +160,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)
         patch.setattr(model, "FullModel", stand_in_model.ToyModel)
+        patch.setattr(executor, "local", lambda workers: here)  # starts no process
         patch.setattr(maximum, "simulate", stand_in_model.simulate)
         stages.run(where / "case.toml", "map", Silent())
     return where / "case"
