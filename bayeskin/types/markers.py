@@ -1,0 +1,43 @@
+"""Tracks of points on the skin, as image correlation gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayeskin.types.arrays import Array, FreezesArrays
+
+
+@dataclass(frozen=True)
+class Markers(FreezesArrays):
+    """Tracks of p points on the skin over t images, on the axis of time of their recording.
+
+    Positions are in the plane of a distant camera that looks down on the skin. x runs along the pull and y
+    across it. The origin is midway between the pads before the test. Every point is seen in the first image.
+
+    time_s : times of the images, (t,)
+    position_m : positions, (t, p, 2); NaN where a point was not seen
+    points : the name of each point, (p,)
+    sha256 : hash of the source file's bytes
+    """
+
+    time_s: Array
+    position_m: Array
+    points: tuple[str, ...]
+    name: str
+    sha256: str
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "points", tuple(self.points))  # a file has a list
+
+    @property
+    def reference_m(self) -> Array:
+        """Returns the positions in the first image, (p, 2)."""
+        return np.asarray(self.position_m[0])
+
+    @property
+    def displacement_m(self) -> Array:
+        """Returns the displacements since the first image, in the images after it, (t - 1, p, 2)."""
+        return np.asarray(self.position_m[1:] - self.position_m[0])
