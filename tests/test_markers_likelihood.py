@@ -49,7 +49,8 @@ def likelihood(space: ParameterSpace, theta: Array, lost: bool = True) -> Marker
         moved_m[1:, 2] = np.nan
     position_m = PLACES_M + np.concatenate([np.zeros((1, 5, 2)), moved_m])
     markers = Markers(np.arange(4.0), position_m, tuple("abcde"), "toy", "0")
-    return MarkerLikelihood(markers, model, camera=CAMERA)
+    errors_m = 2e-5 * rng.standard_normal((2, 3, 5, 2))
+    return MarkerLikelihood(markers, model, errors_m, camera=CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -71,27 +72,33 @@ def covariance(places_m: Array, sd_m: float) -> Array:
     return flat @ flat.T + sd_m**2 * np.eye(len(flat))
 
 
+def whole(markers: MarkerLikelihood) -> Array:
+    """The covariance of all coordinates of all images, (30, 30)."""
+    errors = markers.errors_m.reshape(2, -1)
+    return np.kron(np.eye(3), covariance(PLACES_M, SD_M)) + errors.T @ errors
+
+
 def test_the_density_is_that_of_the_whole_covariance(joint: tuple[LogPosterior, Array]) -> None:
     markers, theta = joint[0].markers, joint[1]
     assert markers is not None
     predicted_m = markers.model.predict_m(theta[:5])
-    expected = 0.0
-    for image, moved_m in enumerate(markers.markers.displacement_m):
-        seen = np.isfinite(moved_m[:, 0])
-        difference = (moved_m - predicted_m[0, image])[seen].ravel()
-        expected += multivariate_normal(cov=covariance(PLACES_M[seen], SD_M)).logpdf(difference)
-    found = markers.log_density(predicted_m, np.array([SD_M]))
-    assert float(found[0]) == pytest.approx(expected, abs=1e-8)
+    observed_m = markers.markers.displacement_m
+    seen = np.isfinite(observed_m).ravel()
+    difference = (observed_m - predicted_m[0]).ravel()[seen]
+    expected = multivariate_normal(cov=whole(markers)[np.ix_(seen, seen)]).logpdf(difference)
+    density = markers.log_density(predicted_m, np.array([SD_M]))
+    assert float(density[0]) == pytest.approx(expected, abs=1e-8)
 
 
 def test_whitened_columns_have_the_inverse_covariance(joint: tuple[LogPosterior, Array]) -> None:
     markers = joint[0].markers
     assert markers is not None
     columns = np.random.default_rng(2).standard_normal((3, 10, 4))
-    white = markers.whitened(columns, SD_M)
-    inverse = np.linalg.inv(covariance(PLACES_M, SD_M))
-    np.testing.assert_allclose(white[0].T @ white[0], columns[0].T @ inverse @ columns[0], rtol=1e-6)
-    assert np.all(white[1:, 4:6] == 0.0)  # the lost point
+    white = markers.whitened(columns, SD_M).reshape(30, 4)
+    seen = np.isfinite(markers.markers.displacement_m).ravel()
+    inverse = np.linalg.inv(whole(markers)[np.ix_(seen, seen)])
+    flat = columns.reshape(30, 4)[seen]
+    np.testing.assert_allclose(white.T @ white, flat.T @ inverse @ flat, rtol=1e-6)
 
 
 def test_a_free_camera_hides_the_mean_displacement(joint: tuple[LogPosterior, Array]) -> None:

@@ -76,6 +76,8 @@ class Config(Section):
         twice = next((stem for stem in stems if stems.count(stem) > 1), None)
         if twice is not None:
             raise InputError("recordings", f"{twice!r} twice", "files of different names")
+        if any(recording.markers is not None for recording in self.each_recording):
+            self._refuse_markers_without_their_model()
         if self.recordings and self.fit.windows_s is not None:
             raise InputError("fit.windows_s", "windows", "none with several recordings")
         if self.recordings and self.model.spec().formulation.fixed_discretisation:
@@ -84,6 +86,19 @@ class Config(Section):
         if self.recordings and self.surrogate.file is not None:
             raise InputError("surrogate.file", "a value", "none with several recordings")
         return self
+
+    def _refuse_markers_without_their_model(self) -> None:
+        """Raises InputError for markers beside several recordings, or with a model without displacements."""
+        model = self.model.spec()
+        if self.recordings:
+            raise InputError("recordings.markers", "a value", "markers only with a single [recording]")
+        if not (model.formulation.reducible and model.mesh == "bricks"):
+            found = f"markers with observation {model.observation!r} and mesh {model.mesh!r}"
+            raise InputError("recording.markers", found, "observation 'reaction' on mesh 'bricks'")
+        if self.surrogate.file is not None:
+            raise InputError(
+                "surrogate.file", "a value with markers", "no such line, because it knows the force only"
+            )
 
     @property
     def each_recording(self) -> tuple[RecordingConfig, ...]:
@@ -129,6 +144,8 @@ class Config(Section):
                 del plain[name]
         if not self.recordings:
             del plain["recordings"]
+            if plain["recording"]["markers"] is None:
+                del plain["recording"]["markers"]
         if not self.fit.shared:
             del plain["fit"]["shared"]
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()

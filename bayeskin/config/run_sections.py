@@ -27,11 +27,13 @@ class RecordingConfig(Section):
     """The recording, and how the protocol of the model follows its displacement.
 
     With "idealised", the protocol goes straight between the recording's corners, whose times and
-    displacements are rounded. With "recorded", it follows the measured displacement closely.
+    displacements are rounded. With "recorded", it follows the measured displacement closely. `markers` is a
+    file with tracks of points on the skin, as `bayeskin import --markers` writes it.
     """
 
     file: str
     protocol: Literal["recorded", "idealised"] = "idealised"
+    markers: str | None = None
 
 
 class ModelConfig(Section):

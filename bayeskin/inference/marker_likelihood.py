@@ -2,13 +2,15 @@
 
 The displacements of the visible points in an image, since the first image, are
 
-    d = u(theta) + B c + e ,   e ~ N(0, s^2 I) ,   c ~ N(0, S)
+    d = u(theta) + E z + B c + e ,   e ~ N(0, s^2 I) ,   c ~ N(0, S) ,   z ~ N(0, I)
 
-where u is the model's displacement and the three columns of B are a unit translation along x, one along y,
-and a unit rotation about the origin. The motion c of the camera is not known. It is integrated out, with its
-prior covariance S = diag(t^2, t^2, r^2), so that d - u has the covariance s^2 I + B S B'. With the singular
-value decomposition of B S^(1/2), its inverse and determinant take a few sums for each image (Woodbury's
-identity). A camera that may move far hides the mean displacement and the mean rotation of the points.
+where u is the model's displacement, the columns of E are its errors, and the three columns of B are a unit
+translation along x, one along y, and a unit rotation about the origin. The motion c of the camera is not
+known. It is integrated out, with its prior covariance S = diag(t^2, t^2, r^2). With the singular value
+decomposition of B S^(1/2), the inverse and the determinant of C = s^2 I + B S B' take a few sums for each
+image. The errors z are common to all images, and are integrated out too: the covariance of d - u over all
+images is C + E E' (Woodbury's identity, twice). A camera that may move far hides the mean displacement and
+the mean rotation of the points.
 
 The noise is independent from image to image. The first image is the reference of image correlation, so its
 places count as exact.
@@ -58,14 +60,26 @@ class PredictsMarkers(Protocol):
 class MarkerLikelihood:
     """The tracks of markers with a model of them.
 
+    errors_m (r, t - 1, p, 2) : errors of the model's displacements, of one sd each
     sd_m : bounds of the log-uniform prior of the noise's sd [m]; a known sd has bounds that are all but equal
     camera : prior sd of the camera's motion in each image
     """
 
     markers: Markers
     model: PredictsMarkers
+    errors_m: Array
     sd_m: tuple[float, float] = (1e-6, 1e-3)
     camera: CameraMotion = CameraMotion()
+
+    @cached_property
+    def _errors(self) -> Array:
+        """Returns the errors of the coordinates that were seen, and zeros elsewhere, (r, t - 1, 2 p)."""
+        return np.asarray(self.errors_m.reshape(len(self.errors_m), *self._seen.shape) * self._seen)
+
+    @cached_property
+    def _errors_along(self) -> Array:
+        """Returns the errors' parts along the shapes of the camera's motion, (r, t - 1, 3)."""
+        return np.einsum("rtq,tqc->rtc", self._errors, self._camera[0], optimize=True)
 
     @property
     def parameter(self) -> Parameter:
@@ -112,14 +126,40 @@ class MarkerLikelihood:
         predicted_m : displacements (n, t - 1, p, 2), or (1, ...) for all sd; sd_m (n,) : sd of the noise
         """
         residual, (shapes, variance) = self.residual_m(predicted_m), self._camera
-        along = np.einsum("ntq,tqc->ntc", residual, shapes)
+        along = np.einsum("ntq,tqc->ntc", residual, shapes, optimize=True)
         white = sd_m[:, None] ** 2
         total = white[:, :, None] + variance  # (n, t - 1, 3)
         across = np.sum(residual**2, axis=2) - np.sum(along**2, axis=2)
         square = np.sum(across / white + np.sum(along**2 / total, axis=2), axis=1)
         free = self._seen.sum(axis=1) - 3.0
         log_scale = np.sum(free * np.log(white) + np.sum(np.log(total), axis=2), axis=1)
-        return np.asarray(-0.5 * (square + log_scale + self._seen.sum() * np.log(2.0 * np.pi)))
+        explained, log_more = self._errors_explain(
+            residual, along, white, 1.0 / white[:, :, None] - 1.0 / total
+        )
+        log_scale = log_scale + log_more
+        return np.asarray(-0.5 * (square - explained + log_scale + self._seen.sum() * np.log(2.0 * np.pi)))
+
+    def _errors_explain(
+        self, residual: Array, along: Array, white: Array, less: Array
+    ) -> tuple[Array, Array]:
+        """Returns by how much the errors lower the exponent and raise the log determinant, (n,) each.
+
+        residual (n, t - 1, 2 p), along (n, t - 1, 3) : residuals and their parts along the camera's motion
+        white (n, 1) : variance of the noise; less (n, t - 1, 3) : precision that the camera's motion takes
+        """
+        n, rank = len(residual), len(self.errors_m)
+        errors, errors_along = self._errors.reshape(rank, -1), self._errors_along.reshape(rank, -1)
+        pairs = (errors_along[:, None] * errors_along).reshape(rank * rank, -1)
+        gram = (errors @ errors.T) / white[:, :, None]
+        gram = gram - (less.reshape(len(less), -1) @ pairs.T).reshape(-1, rank, rank)
+        pull = (
+            residual.reshape(n, -1) @ errors.T / white
+            - (less * along).reshape(-1, pairs.shape[1]) @ errors_along.T
+        )
+        lower = np.linalg.cholesky(np.eye(rank) + gram)
+        known = np.linalg.solve(lower, np.broadcast_to(pull, (len(lower), rank))[:, :, None])
+        log_more = 2.0 * np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
+        return np.sum(known[:, :, 0] ** 2, axis=1), log_more
 
     def whitened(self, columns_m: Array, sd_m: float) -> Array:
         """Returns columns (t - 1, 2 p, c) [m] divided by the root of the covariance, in units of its sd.
@@ -127,11 +167,21 @@ class MarkerLikelihood:
         The sum of squares of a whitened residual is the exponent of the density. Coordinates that were not
         seen give zeros.
         """
+        white = self._without_errors(columns_m, sd_m)
+        errors = self._without_errors(self._errors.transpose(1, 2, 0), sd_m)
+        shapes, size, _ = np.linalg.svd(errors.reshape(-1, len(self.errors_m)), full_matrices=False)
+        flat = white.reshape(-1, white.shape[2])
+        less = 1.0 / np.sqrt(1.0 + size**2) - 1.0
+        return np.asarray((flat + shapes @ (less[:, None] * (shapes.T @ flat))).reshape(white.shape))
+
+    def _without_errors(self, columns_m: Array, sd_m: float) -> Array:
+        """Returns `whitened` columns for a model without errors."""
         shapes, variance = self._camera
         seen = columns_m * self._seen[:, :, None]
-        along = np.einsum("tqk,tqc->tkc", shapes, seen)
+        along = np.einsum("tqk,tqc->tkc", shapes, seen, optimize=True)
         less = 1.0 / np.sqrt(sd_m**2 + variance) - 1.0 / sd_m
-        return np.asarray(seen / sd_m + np.einsum("tqk,tkc->tqc", shapes, less[:, :, None] * along))
+        turned = np.einsum("tqk,tkc->tqc", shapes, less[:, :, None] * along, optimize=True)
+        return np.asarray(seen / sd_m + turned)
 
     def without_camera(self, predicted_m: Array, sd_m: float) -> Array:
         """Returns the residuals (t - 1, p, 2) [m] less the most probable motion of the camera in each image.
@@ -150,6 +200,6 @@ class MarkerLikelihood:
         """Returns a hash of the tracks, their model and the priors."""
         plain = [dict(self.model.provenance), self.sd_m, asdict(self.camera)]
         digest = hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode())
-        for array in (self.markers.time_s, self.markers.position_m):
+        for array in (self.markers.time_s, self.markers.position_m, self.errors_m):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()

@@ -11,10 +11,10 @@ import numpy as np
 from bayeskin.forward.interface import ForwardModel, ModelRun
 from bayeskin.forward.joint import JointForward
 from bayeskin.forward.observed import FullForce
-from bayeskin.forward.posterior import posterior_of
+from bayeskin.forward.posterior import marker_likelihood, posterior_of
 from bayeskin.forward.reduced import ReducedForward
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.marker_likelihood import MARKER_SD, MarkerLikelihood
+from bayeskin.inference.marker_likelihood import MARKER_SD
 from bayeskin.inference.noise_model import ALL, noise_space
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
 from bayeskin.mechanisms.each_recording import in_each_recording, in_one_recording
@@ -196,7 +196,8 @@ class DiagnosisContext:
         )  # fmt: skip
         if self.markers is not None:
             model = MarkerTangent(self.space(names), tuple(runs))
-            posterior = replace(posterior, markers=MarkerLikelihood(self.markers, model))
+            markers = marker_likelihood(self.markers, model, self.forward.spec, self.motion)
+            posterior = replace(posterior, markers=markers)
         if correction_n is None or posterior.model_error is None:
             return posterior
         return replace(posterior, model_error=replace(posterior.model_error, measured_n=correction_n[None]))
