@@ -196,7 +196,8 @@ class DiagnosisContext:
         )  # fmt: skip
         if self.markers is not None:
             model = MarkerTangent(self.space(names), tuple(runs))
-            markers = marker_likelihood(self.markers, model, self.forward.spec, self.motion)
+            seen = self.markers if until_s is None else self.markers.until(until_s)
+            markers = marker_likelihood(seen, model, self.forward.spec, self.motion)
             posterior = replace(posterior, markers=markers)
         if correction_n is None or posterior.model_error is None:
             return posterior

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,11 @@ class Markers(FreezesArrays):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "points", tuple(self.points))  # a file has a list
+
+    def until(self, end_s: float) -> Markers:
+        """Returns the same images, in which no point was seen after a given time."""
+        unseen = (self.time_s > end_s)[:, None, None]
+        return replace(self, position_m=np.where(unseen, np.nan, self.position_m))
 
     @property
     def reference_m(self) -> Array:

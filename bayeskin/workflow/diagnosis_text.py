@@ -22,6 +22,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
     )
     lines += [_agreement_line(recording) for recording in answer["recordings"]]
     lines += [_fit_line(label, answer["fit"][label]) for label in ("before", "after")]
+    lines += [_skin_line(label, answer["fit"][label]) for label in ("before", "after")
+              if "on_skin" in answer["fit"][label]]  # fmt: skip
     lines.append(full_run_in_words(answer["full_model"]))
     after = answer["fit"]["after"]
     if not (after["emulator"]["settled"] and after["sampled"]["settled"]):
@@ -43,6 +45,13 @@ def _agreement_line(recording: Mapping[str, Any]) -> str:
         return f"{name}: {residual}; it could not be fitted alone"
     verb = "contradicts" if recording["contradicts"] else "agrees with"
     return f"{name} {verb} the others, by {max(tension, 0.0):.1f} sd: {residual}"
+
+
+def _skin_line(label: str, fit: Mapping[str, Any]) -> str:
+    """Returns a line about the markers that move otherwise than a fit says."""
+    located = fit["on_skin"]
+    line = f"{label}: at {located['significant']} of {located['points']} markers the skin moves otherwise"
+    return f"{line}, {1e3 * located['rms_m']:.3f} mm RMS at the largest opening"
 
 
 def _fit_line(label: str, fit: Mapping[str, Any]) -> str:
