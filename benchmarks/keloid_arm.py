@@ -53,6 +53,7 @@ PAD_HALF_WIDTH_MM = 4.0
 EVERY_POINT, EVERY_IMAGE = 2, 4  # of the grid along x and along y, and of the images, for the fits
 LOST_MM = 0.5  # a point that moves so far from the others in one image is lost from then on
 OUTLINE_PX_A_MM, OUTLINE_CENTRE_MM = 165.0 / 8.0, np.array([50.0, 20.0])  # of the authors' geometry
+SHIFTS_MM = tuple(float(shift) for shift in range(-7, 8))
 MODEL = shipped("surrogates/article-device-reduced.h5")
 PAGE = Path(__file__).parents[1] / "docs" / "markers.md"
 START = {"E_c": 100e3, "E_s": 10e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 0.0}
@@ -89,6 +90,8 @@ def in_mm(position_px: Array) -> tuple[Array, float]:
 def write_tables(folder: Path, out: Path) -> tuple[Path, Path, Path, float]:
     """Writes the recording, a thin table of tracks and the whole one; returns their files and pixels a mm."""
     opening_mm, force_n = (np.loadtxt(folder / f"{name}_moving_pad.dat") for name in ("u", "f"))
+    closed = int(np.argmin(opening_mm))  # the first samples drift towards zero before the pads open
+    opening_mm, force_n = opening_mm[closed:], force_n[closed:]
     time_s = np.arange(len(force_n)) / RATE_HZ
     recording = out / "arm.csv"
     np.savetxt(recording, np.column_stack([time_s, opening_mm, force_n]), "%.6f", ",", comments="",
@@ -165,21 +168,35 @@ def outline_mm(file: Path, per_mm: float) -> Array:
     return np.concatenate([points, points[:1]]) * OUTLINE_PX_A_MM / per_mm
 
 
-def comparison(located: OnSkin, outline: Array) -> list[list[str]]:
-    """Returns table rows that compare residuals inside and outside of an outline."""
-    inside = Polygon(outline).contains_points(1e3 * located.place_m)
-    length_mm = 1e3 * np.linalg.norm(located.vector_m, axis=1)
-    quantities = {
-        "residual [mm]": length_mm,
-        "missing strain along the pull [%]": 100.0 * located.strain[:, 0],
-        "missing strain across the pull [%]": 100.0 * located.strain[:, 1],
-        "size of the missing strain [%]": 100.0 * np.linalg.norm(located.strain, axis=1),
+def quantities(located: OnSkin) -> dict[str, Array]:
+    """Returns the quantities (p,) that are compared inside and outside of the outline."""
+    outward = np.sign(located.place_m[:, 0]) * located.vector_m[:, 0]
+    return {
+        "length of the residual [mm]": 1e3 * np.linalg.norm(located.vector_m, axis=1),
+        "residual away from the middle [mm]": 1e3 * outward,
+        "strain along the pull [%]": 100.0 * located.strain[:, 0],
+        "strain across the pull [%]": 100.0 * located.strain[:, 1],
     }
-    return [
-        [name, f"{np.mean(values[inside]):.3f}", f"{np.mean(values[~inside]):.3f}",
-         f"{ranked_above(values[inside], values[~inside]):.2f}"]
-        for name, values in quantities.items()
-    ]  # fmt: skip
+
+
+def comparison(located: OnSkin, outline: Array) -> list[list[str]]:
+    """Returns table rows that compare residuals inside and outside of an outline.
+
+    The last cell is the shift of the outline across the pull [mm] at which inside and outside differ most.
+    """
+    place_mm, table = 1e3 * located.place_m, []
+    for name, values in quantities(located).items():
+        cells, by_shift = [name], {}
+        for shift in SHIFTS_MM:
+            inside = Polygon(outline + np.array([0.0, shift])).contains_points(place_mm)
+            by_shift[shift] = ranked_above(values[inside], values[~inside])
+        inside = Polygon(outline).contains_points(place_mm)
+        cells += [f"{np.mean(values[inside]):.2f}", f"{np.mean(values[~inside]):.2f}", f"{by_shift[0.0]:.2f}"]
+        for half in (place_mm[:, 0] < 0.0, place_mm[:, 0] >= 0.0):
+            cells.append(f"{ranked_above(values[inside & half], values[~inside & half]):.2f}")
+        best = max(by_shift, key=lambda shift: abs(by_shift[shift] - 0.5))
+        table.append([*cells, f"{best:+.0f} mm: {by_shift[best]:.2f}"])
+    return table
 
 
 def ranked_above(first: Array, second: Array) -> float:
@@ -221,7 +238,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         table,
     )
     compared = rows.markdown(
-        ["", "inside", "outside", "P(inside > outside)"], comparison(best_located, outline)
+        [
+            "recorded minus fitted",
+            "inside",
+            "outside",
+            "P",
+            "P left",
+            "P right",
+            "largest contrast at a shift of",
+        ],
+        comparison(best_located, outline),
     )
     print(fitted, compared, f"{per_mm:.2f} px/mm", sep="\n\n")
     rows.into_docs(PAGE, "keloid fits", fitted)

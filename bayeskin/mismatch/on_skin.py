@@ -20,7 +20,9 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, PadMotion
 
 LEVEL = 0.05  # probability that noise alone makes any point significant
-NEIGHBOURS = 9  # points that give a strain, the point itself included
+NEIGHBOURS, NEAR = 9, 0.05  # least number, and share, of the points that give a strain at one of them
+REWEIGHTED, TINY_M = 10, 1e-9
+WRONG = 3.0  # a residual so many times the median has half the weight
 MAD_TO_SD = 1.4826  # of normal variables
 
 
@@ -81,12 +83,21 @@ def _scatter(residual_m: Array) -> float:
 def strains(place_m: Array, vector_m: Array) -> Array:
     """Returns the strains (p, 3) of vectors at places: along x, along y, and shear.
 
-    Each is the slope of a plane through the nearest points. NaN where the points are too few.
+    Each is the slope of a plane through the nearest points, in which single wrong tracks weigh little
+    (reweighted least squares with Cauchy's weights). NaN where the points are too few.
     """
     if len(place_m) < NEIGHBOURS:
         return np.full((len(place_m), 3), np.nan)
-    near = cKDTree(place_m).query(place_m, NEIGHBOURS)[1]
-    design = np.concatenate([np.ones((*near.shape, 1)), place_m[near] - place_m[:, None]], axis=2)
-    slopes = np.linalg.pinv(design) @ vector_m[near]  # (p, 3, 2)
-    along, across = slopes[:, 1, 0], slopes[:, 2, 1]
-    return np.stack([along, across, 0.5 * (slopes[:, 1, 1] + slopes[:, 2, 0])], axis=1)
+    near = cKDTree(place_m).query(place_m, max(NEIGHBOURS, round(NEAR * len(place_m))))[1]
+    apart = place_m[near] - place_m[:, None]
+    reach = np.abs(apart).max()
+    design = np.concatenate([np.ones((*near.shape, 1)), apart / reach], axis=2)  # (p, k, 3)
+    weight, values = np.ones(near.shape), vector_m[near]
+    for _ in range(REWEIGHTED):
+        weighted = design * weight[:, :, None]
+        slopes = np.linalg.solve(weighted.transpose(0, 2, 1) @ design, weighted.transpose(0, 2, 1) @ values)
+        off = np.linalg.norm(values - design @ slopes, axis=2)
+        usual = np.median(off, axis=1, keepdims=True) + TINY_M
+        weight = 1.0 / (1.0 + (off / (WRONG * usual)) ** 2)
+    slopes = slopes / reach
+    return np.stack([slopes[:, 1, 0], slopes[:, 2, 1], 0.5 * (slopes[:, 1, 1] + slopes[:, 2, 0])], axis=1)

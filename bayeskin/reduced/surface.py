@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayeskin.finite_element.surface_points import since_first, surface_displacement
-from bayeskin.geometry import LENGTHS, moved
+from bayeskin.geometry import LENGTHS, Geometry, moved
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.reduced.model import ReducedModel
@@ -36,6 +36,7 @@ class SurfaceRun:
 def simulate_surface(
     model: ReducedModel, motion: PadMotion, theta: Mapping[str, float], mechanisms: Sequence[Mechanism],
     gradients: Mapping[str, float] | None, points_m: Array, time_s: Array, least_stiffness: float,
+    geometry: Geometry | None = None,
 ) -> SurfaceRun:  # fmt: skip
     """Returns a run of a reduced model with the displacements of points.
 
@@ -53,13 +54,14 @@ def simulate_surface(
             by_state.append(by)
 
     simulation = simulate_reduced(
-        model, motion, theta, mechanisms, gradients, on_reduced_state=on_reduced_state,
+        model, motion, theta, mechanisms, gradients, geometry, on_reduced_state=on_reduced_state,
         least_stiffness=least_stiffness,
     )  # fmt: skip
     if simulation.status != "ok":
         return SurfaceRun(simulation)
     tissue = sorted(m.name for m in mechanisms if isinstance(m.act, Tissue))
-    matrix = _matrix(model, tissue, theta, points_m)
+    lengths = geometry or model.trained.geometry
+    matrix = _matrix(model, tissue, moved(lengths, theta), points_m)
     fields = matrix.shape[1]
     coefficients = np.array(states)[:, :fields]
     displacement_m = since_first(simulation, coefficients @ matrix.T, time_s)
@@ -69,15 +71,14 @@ def simulate_surface(
     for column, (name, change) in enumerate(gradients.items()):
         if name in LENGTHS:  # the points stay where they are, but the nodes move
             step = SENSITIVITY.length_step * change
-            up, down = (_matrix(model, tissue, {**theta, name: theta[name] + way * step}, points_m)
-                        for way in (1.0, -1.0))  # fmt: skip
+            ends = [moved(lengths, {**theta, name: theta[name] + way * step}) for way in (1.0, -1.0)]
+            up, down = (_matrix(model, tissue, end, points_m) for end in ends)
             by_m[:, :, column] += coefficients @ (up - down).T / (2.0 * SENSITIVITY.length_step)
     return SurfaceRun(simulation, displacement_m, since_first(simulation, by_m, time_s))
 
 
-def _matrix(model: ReducedModel, tissue: Sequence[str], theta: Mapping[str, float], points_m: Array) -> Array:
+def _matrix(model: ReducedModel, tissue: Sequence[str], geometry: Geometry, points_m: Array) -> Array:
     """Returns the matrix (2 p, k) that gives the displacements of points from the coefficients of a state."""
-    geometry = moved(model.trained.geometry, theta)
     key = id(model), tuple(tissue), geometry, points_m.tobytes()
     if key not in _known:
         while len(_known) >= MOST_KNOWN:

@@ -48,29 +48,31 @@ class _OnSkin(Protocol):
 
 @styled
 def figure_on_skin(located: _OnSkin, lengths: Geometry, outlines_m: Sequence[Array] = ()) -> Figure:
-    """Returns the figure: residual vectors on the skin, and the strain along the pull that the model lacks.
+    """Returns the figure: residual vectors on the skin, and the strains that the model lacks.
 
     lengths : the device, whose pads and guards are drawn; outlines_m : further outlines (k, 2) [m]
     """
-    figure = new_figure(PAGE_IN, 3.3)
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    _draw_vectors(left, located)
-    _draw_strain(figure, right, located)
-    titles = ("recorded minus fitted", "recorded minus fitted strain along the pull")
-    for ax, letter, title in zip((left, right), "ab", titles, strict=True):
+    figure = new_figure(PAGE_IN, 2.9)
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    _draw_vectors(panels[0], located)
+    _draw_strain(figure, panels[1], located, 0)
+    _draw_strain(figure, panels[2], located, 1)
+    titles = ("recorded minus fitted", "strain along the pull", "strain across it")
+    for ax, letter, title in zip(panels, "abc", titles, strict=True):
         _draw_device(ax, lengths, located.place_m)
         for outline_m in outlines_m:
             ax.plot(*(1e3 * outline_m.T), color=INK, lw=1.2)
         panel_title(ax, letter, title)
         ax.set(aspect="equal", xlabel="along the pull [mm]")
-    left.set_ylabel("across the pull [mm]")
+    panels[0].set_ylabel("across the pull [mm]")
     count = int(located.significant.sum())
     state_finding(
         figure,
         f"At {count} of {len(located.place_m)} points the skin moves otherwise than the model allows "
         f"({number(1e3 * located.rms_m)} mm RMS at the largest opening)",
-        "Residuals in proportion to the opening, without the camera's motion. Orange: larger than noise and "
-        "the allowed error of the model explain (5 % for any point). Grey outlines: pads and guards.",
+        "a: residuals in proportion to the opening, without the camera's motion; orange: larger than noise "
+        "and the allowed error of the model explain (5 % for any point). b, c: the strain of these "
+        "residuals. Grey outlines: pads and guards.",
     )
     return figure
 
@@ -89,19 +91,19 @@ def _draw_vectors(ax: Axes, located: _OnSkin) -> None:
     ax.quiverkey(arrows, 0.86, 1.04, enlarged * scale_mm, f"{scale_mm:g} mm", labelpos="E", color=INK)
 
 
-def _draw_strain(figure: Figure, ax: Axes, located: _OnSkin) -> None:
-    """Draws the strain along the pull at each point."""
-    strain = 100.0 * located.strain[:, 0]
+def _draw_strain(figure: Figure, ax: Axes, located: _OnSkin, component: int) -> None:
+    """Draws a strain at each point: along the pull (0) or across it (1)."""
+    strain = 100.0 * located.strain[:, component]
     if not np.isfinite(strain).any():
         ax.text(0.5, 0.5, "too few points", transform=ax.transAxes, ha="center", color=GREY)
         return
     limit = max(float(np.quantile(np.abs(strain), 0.98)), 1e-3)
-    size = 3000.0 / max(len(strain), 25)
+    size = 2500.0 / max(len(strain), 25)
     x_mm, y_mm = 1e3 * located.place_m.T
     dots = ax.scatter(
         x_mm, y_mm, size, strain, marker="s", lw=0, cmap="RdBu_r", vmin=-limit, vmax=limit
     )  # fmt: skip
-    figure.colorbar(dots, ax=ax, label="strain [%]", shrink=0.8)
+    figure.colorbar(dots, ax=ax, label="strain [%]", location="bottom", shrink=0.8, pad=0.02)
 
 
 def _draw_device(ax: Axes, lengths: Geometry, place_m: Array) -> None:

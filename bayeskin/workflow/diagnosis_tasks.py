@@ -22,8 +22,8 @@ from bayeskin.mismatch.tasks import AnswerTasks, Task
 from bayeskin.recordings import analyse, bin_recording, jumps_of
 from bayeskin.recordings.join import join_bins, join_jumps
 from bayeskin.store import Store
-from bayeskin.types import BinnedForce, Jumps, Markers, PadMotion, ParameterSpace, Recording
-from bayeskin.workflow.recording import MARKERS
+from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording
+from bayeskin.workflow.recording import recorded_markers
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,12 @@ class ContextSource:
 def open_context(source: ContextSource) -> DiagnosisContext:
     """Returns the context from the files and settings of a source."""
     binned, jumps, motion = calm_bins(source.recording)
-    markers = markers_of(source.recording)
+    markers = recorded_markers(source.recording)
     forward = forward_model(source.model, source.spec, motion, binned.edges_s, markers)
     noise = dict(source.noise)
     return DiagnosisContext(
         binned, jumps, motion, forward, source.base, source.seed, noise, source.shared, markers
     )
-
-
-def markers_of(folder: Path) -> Markers | None:
-    """Returns the tracks of points in the folder of the stage `recording`, or None where there are none."""
-    file = folder / MARKERS
-    return storage.load(file, Markers) if file.exists() else None
 
 
 def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:

@@ -129,6 +129,12 @@ def _markers(run: Run, recording: Recording) -> Markers | None:
     return markers
 
 
+def recorded_markers(folder: Path) -> Markers | None:
+    """Returns the tracks of points in the folder of this stage, or None where there are none."""
+    file = folder / MARKERS
+    return storage.load(file, Markers) if file.exists() else None
+
+
 def _named(run: Run, section: RecordingConfig) -> Recording:
     """Returns a recording; one of several has the name of its file."""
     file = run.beside(section.file)
