@@ -27,6 +27,7 @@ from matplotlib.path import Path as Polygon
 
 from bayeskin import storage
 from bayeskin.design import default_space
+from bayeskin.finite_element.mesh_change import mesh_change
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.fit import Fit
@@ -135,7 +136,9 @@ def opened(recording: Path, markers: Path, folder: Path) -> DiagnosisContext:
     storage.save(folder / "recording.h5", samples)
     storage.save(folder / "motion.h5", motion)
     storage.save(folder / "binned.h5", bin_recording(samples, phases, edges_s, analyse(samples, phases)))
-    storage.save(folder / "markers.h5", storage.load(markers_beside(out), Markers))
+    markers = storage.load(markers_beside(out), Markers)
+    markers = replace(markers, mesh_change_m=mesh_change(ModelSpec(), motion, markers))
+    storage.save(folder / "markers.h5", markers)
     return open_context(ContextSource(folder, MODEL, ModelSpec(), 1, default_space()))
 
 

@@ -2,8 +2,12 @@
 
 Each case is a run of the full model on the article's device: 6 mm of opening, a hold of 30 s, a return. The
 force gets noise as in `noisy_recordings`. The markers are a grid of 5 x 5 points, seen every 2 s, with noise
-of 0.02 mm and a random motion of the camera. Fits by the shipped reduced model start at the true skin. Their
-Laplace approximation gives the widths and the evidence, with and without markers.
+of 0.02 mm and a random motion of the camera. Fits by the shipped reduced model start at the true skin, and
+fits of the concealed mechanism at its true values. Their Laplace approximation gives the widths and the
+evidence, with and without markers.
+
+Data and fits are on the mesh of 448 bricks, so the correction for the mesh is left out. Its uncertainty is
+allowed for. In the case "finer mesh" the data are from 1,540 bricks, and the correction is used.
 
     python benchmarks/markers.py        # half an hour of one core, the first time
 
@@ -15,6 +19,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -28,11 +33,14 @@ from bayeskin import storage
 from bayeskin.design import default_space
 from bayeskin.finite_element.accepted import AcceptedSteps
 from bayeskin.finite_element.formulation import RunRequest
+from bayeskin.finite_element.mesh_change import mesh_change
 from bayeskin.finite_element.problem import Problem, material
 from bayeskin.finite_element.reaction import Reaction
 from bayeskin.finite_element.simulate import ModelSpec, problem_of
 from bayeskin.finite_element.surface_points import SurfaceTracks, surface_displacement
+from bayeskin.forward.interface import ModelRun
 from bayeskin.forward.reduced import ReducedForward
+from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import catalogue, laws
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.trust_region import fit_set
@@ -55,7 +63,7 @@ SKINS = {
     "demo": {"E_c": 60e3, "E_s": 15e3, "k_c": 2e-14, "k_s": 8e-13, "p_init": 700.0},
     "stiff": {"E_c": 600e3, "E_s": 20e3, "k_c": 3e-15, "k_s": 3e-14, "p_init": 0.0},
 }
-# Effects on the usual skin: mechanism, its concealed values, and where fits of this mechanism start.
+# Effects on the usual skin: mechanism, its concealed values, and where fits of it to other effects start.
 EFFECTS: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "fibre-anisotropy": (
         {"langer_ratio": 2.0, "langer_angle": np.pi / 2},
@@ -96,7 +104,7 @@ class Case:
 CASES = {
     "usual": Case(), "demo": Case("demo"), "stiff": Case("stiff"), "finer mesh": Case(refinement=2),
     **{effect: Case(effect=effect) for effect in EFFECTS},
-    "guard that slips": Case(slip=0.5),
+    "guard that slips": Case(slip=0.02),
 }  # fmt: skip
 
 
@@ -129,6 +137,13 @@ def full_run(case: Case) -> tuple[Simulation, Array]:
 
 
 @cache
+def change_of_mesh() -> Array:
+    """Returns the change (t - 1, p, 2) [m] of the displacements from the coarse to the usual mesh."""
+    markers = Markers(IMAGES_S, np.repeat(PLACES_M[None], len(IMAGES_S), axis=0), (), "", "")
+    return mesh_change(ModelSpec(), MOTION, markers)
+
+
+@cache
 def concealed(name: str) -> Path:
     """Returns a folder with the noisy recording of a case, as the stage `recording` leaves it."""
     rows.say(f"{name}: full run")
@@ -149,7 +164,8 @@ def concealed(name: str) -> Path:
     storage.save(folder / "recording.h5", recording)
     storage.save(folder / "motion.h5", MOTION)
     storage.save(folder / "binned.h5", binned)
-    storage.save(folder / "markers.h5", Markers(IMAGES_S, position_m, names, name, "0"))
+    markers = Markers(IMAGES_S, position_m, names, name, "0")
+    storage.save(folder / "markers.h5", replace(markers, mesh_change_m=change_of_mesh()))
     return folder
 
 
@@ -168,9 +184,19 @@ def fitted(name: str, mechanism: str, markers: bool) -> rows.Row:
     known = TABLE.find(**key)
     if known is not None:
         return known
-    context = context_of(name, markers)
-    start = {**context.noise, **SKINS[CASES[name].skin], **(EFFECTS[mechanism][1] if mechanism else {})}
-    result = fit_set((mechanism,) if mechanism else (), start, context.run, context.posterior)
+    context, case = context_of(name, markers), CASES[name]
+
+    def local(names: Sequence[str], runs: Sequence[ModelRun]) -> LogPosterior:
+        """Returns the posterior; data of the usual mesh have none of the error that is corrected for."""
+        posterior = context.posterior(names, runs)
+        if posterior.markers is None or case.refinement > 1:
+            return posterior
+        nothing_m = np.zeros_like(posterior.markers.correction_m)
+        return replace(posterior, markers=replace(posterior.markers, correction_m=nothing_m))
+
+    values = EFFECTS[mechanism][mechanism != case.effect] if mechanism else {}
+    start = {**context.noise, **SKINS[case.skin], **values}
+    result = fit_set((mechanism,) if mechanism else (), start, context.run, local)
     if isinstance(result, str):
         rows.say(f"{key}: {result}")
         return TABLE.append(**key, log_evidence=float("-inf"), settled=False, force_rms_n=float("nan"),

@@ -50,7 +50,7 @@ def likelihood(space: ParameterSpace, theta: Array, lost: bool = True) -> Marker
     position_m = PLACES_M + np.concatenate([np.zeros((1, 5, 2)), moved_m])
     markers = Markers(np.arange(4.0), position_m, tuple("abcde"), "toy", "0")
     errors_m = 2e-5 * rng.standard_normal((2, 3, 5, 2))
-    return MarkerLikelihood(markers, model, errors_m, camera=CAMERA)
+    return MarkerLikelihood(markers, model, np.zeros((3, 5, 2)), errors_m, CAMERA)
 
 
 @pytest.fixture(scope="module")

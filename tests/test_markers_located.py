@@ -11,8 +11,9 @@ import pytest
 from toys.inference_problems import NOISE, TRUTH, toy_problem
 
 from bayeskin.design import default_space
+from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
-from bayeskin.inference.marker_error import displacement_errors
+from bayeskin.inference.marker_error import mesh_correction, smooth_errors
 from bayeskin.inference.marker_likelihood import CameraMotion, MarkerLikelihood
 from bayeskin.mismatch.on_skin import on_skin, strains
 from bayeskin.report import figure_on_skin
@@ -50,8 +51,8 @@ def fit_with(missing_m: Array) -> Any:
     moved = moved + 2e-4 * rng.standard_normal((len(share), 1, 2)) + SD_M * rng.standard_normal(moved.shape)
     position_m = PLACES_M + np.concatenate([np.zeros((1, *PLACES_M.shape)), moved])
     markers = Markers(AT_S, position_m, tuple(str(i) for i in range(len(PLACES_M))), "toy", "0")
-    errors_m = displacement_errors(markers, MOTION, 36e-3)
-    likelihood = MarkerLikelihood(markers, model, errors_m, camera=CameraMotion(1e-3, 0.02))
+    errors_m = smooth_errors(markers, MOTION, 36e-3)
+    likelihood = MarkerLikelihood(markers, model, np.zeros_like(moved), errors_m, CameraMotion(1e-3, 0.02))
     theta = {**TRUTH, **NOISE, "marker_sd": SD_M}
     return SimpleNamespace(log_posterior=replace(posterior, markers=likelihood), theta=theta)
 
@@ -89,14 +90,25 @@ def test_strains_are_the_slopes_of_a_field_even_with_a_wrong_track() -> None:
 
 def test_the_errors_of_displacements_have_the_symmetry_of_the_test() -> None:
     markers = fit_with(np.zeros_like(PLACES_M)).log_posterior.markers.markers
-    errors_m = displacement_errors(markers, MOTION, 36e-3)
+    errors_m = smooth_errors(markers, MOTION, 36e-3)
     mirrored = np.array(
         [int(np.argmin(np.sum((PLACES_M - place * [-1, 1]) ** 2, axis=1))) for place in PLACES_M]
     )
     np.testing.assert_allclose(errors_m[:, :, mirrored], errors_m * [-1.0, 1.0], atol=1e-12)
     rms = np.sqrt(np.mean(np.sum(errors_m[:, -1] ** 2, axis=0)))
-    assert 0.008 < rms / 2.5e-3 < 0.0101  # of a pad's displacement
+    assert 0.0012 < rms / 2.5e-3 < 0.00151  # of a pad's displacement
     assert np.all(errors_m[:, 0] == 0.0)  # before the pads open
+
+
+def test_a_finer_mesh_lacks_less() -> None:
+    markers = fit_with(np.zeros_like(PLACES_M)).log_posterior.markers.markers
+    with pytest.raises(InputError, match="no change from mesh to mesh"):
+        mesh_correction(markers, 1)
+    known = replace(markers, mesh_change_m=np.full((20, 49, 2), -1e-5))
+    (usual, sd), (finer, _) = mesh_correction(known, 1), mesh_correction(known, 2)
+    np.testing.assert_allclose(usual, -2.5e-6)
+    np.testing.assert_allclose(sd, -6e-7)
+    np.testing.assert_allclose(finer, 0.22 * usual)
 
 
 def test_a_surrogate_of_displacements_knows_that_they_do_not_scale() -> None:

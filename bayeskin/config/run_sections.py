@@ -183,11 +183,15 @@ class FitConfig(Section):
 
 
 class NoiseConfig(Section):
-    """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index."""
+    """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index.
+
+    `marker_sd_m` bounds the sd [m] of the noise of markers.
+    """
 
     sd_n: tuple[float, float] | None = None
     tau_s: tuple[float, float] | None = None
     nu: tuple[float, float] | None = None
+    marker_sd_m: tuple[float, float] | None = None
 
     @model_validator(mode="after")
     def _lower_bounds_lie_below_upper(self) -> NoiseConfig:

@@ -7,7 +7,7 @@ import numpy as np
 from bayeskin.finite_element.accuracy import mesh_error
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.marker_error import displacement_errors
+from bayeskin.inference.marker_error import mesh_correction, smooth_errors
 from bayeskin.inference.marker_likelihood import MarkerLikelihood, PredictsMarkers
 from bayeskin.inference.model_error import ErrorSizes, ModelError
 from bayeskin.inference.noise_model import Windows
@@ -37,8 +37,13 @@ def posterior_of(
 def marker_likelihood(
     markers: Markers, model: PredictsMarkers, spec: ModelSpec, motion: PadMotion
 ) -> MarkerLikelihood:
-    """Returns the likelihood of markers, with the errors of the full model's displacements."""
-    return MarkerLikelihood(markers, model, displacement_errors(markers, motion, spec.geometry.gauge_m))
+    """Returns the likelihood of markers, with the errors of the full model's displacements.
+
+    spec : the full model whose displacements `model` predicts
+    """
+    correction_m, amplitude_m = mesh_correction(markers, spec.refinement)
+    errors_m = np.concatenate([amplitude_m[None], smooth_errors(markers, motion, spec.geometry.gauge_m)])
+    return MarkerLikelihood(markers, model, correction_m, errors_m)
 
 
 def model_error(spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ModelError | None:

@@ -1,10 +1,10 @@
-"""Allows for the error of the full model's own displacements, which its mesh causes.
+"""Corrects for the error of the full model's own displacements, which its mesh causes.
 
-Near the clamped edges of the pads a mesh is too stiff. The skin between the pads then moves too far, by a
-smooth field that grows with the opening of the pads and has the symmetry of the test. The error is therefore
-a Gaussian field over the skin, times the displacement of a pad. Between the pads of the article's device,
-448 bricks are off by 0.45 % of a pad's displacement (RMS, docs/markers.md). This error resembles a change of
-the stiffness ratio of the layers, so about twice its size is allowed for.
+From mesh to mesh the error shrinks by a nearly constant factor, and its shape stays the same. What the usual
+mesh still lacks is therefore about a quarter of what it has gained over the coarse mesh. This is added to the
+model's displacements. Its amplitude is uncertain. A smooth Gaussian field over the skin, times the
+displacement of a pad, allows for what this shape does not describe (docs/markers.md). It has the symmetry of
+the test.
 """
 
 from __future__ import annotations
@@ -15,29 +15,49 @@ from itertools import product
 import numpy as np
 from scipy.linalg import eigh
 
+from bayeskin.errors import InputError
 from bayeskin.types import Array, Markers, PadMotion
 
 
 @dataclass(frozen=True)
 class DisplacementErrors:
-    """Size of the displacements' error.
+    """Sizes of the displacements' error.
 
-    share : sd of the error, RMS over the points, as a share of a pad's displacement
-    length : distance over which the error is correlated, as a share of the distance between the pads
+    lacking, sd : mean and sd of what the usual mesh lacks, as a share of its gain over the coarse mesh
+    shrinks : factor on this share from one refinement to the next
+    smooth : sd of the smooth field, RMS over the points, as a share of a pad's displacement
+    length : distance over which this field is correlated, as a share of the distance between the pads
     shapes : largest number of shapes of each component; kept : share of the largest variance below which a
         shape is left out
     """
 
-    share: float = 1e-2
+    lacking: float = 0.25
+    sd: float = 0.06
+    shrinks: float = 0.22
+    smooth: float = 1.5e-3
     length: float = 0.25
     shapes: int = 8
     kept: float = 1e-3
 
 
-def displacement_errors(
+def mesh_correction(
+    markers: Markers, refinement: int, settings: DisplacementErrors = DisplacementErrors()
+) -> tuple[Array, Array]:
+    """Returns what is added to displacements of a mesh (t - 1, p, 2) [m], and the sd of its amplitude.
+
+    refinement : of the bricks; 1 is the usual mesh
+    Raises InputError for markers whose change from mesh to mesh is not known.
+    """
+    if not markers.mesh_change_m.size:
+        raise InputError("markers", "no change from mesh to mesh", "markers that a run has prepared")
+    scaled_m = settings.shrinks ** (refinement - 1) * markers.mesh_change_m
+    return settings.lacking * scaled_m, settings.sd * scaled_m
+
+
+def smooth_errors(
     markers: Markers, motion: PadMotion, gauge_m: float, settings: DisplacementErrors = DisplacementErrors()
 ) -> Array:
-    """Returns independent errors (r, t - 1, p, 2) [m] of the displacements, of one sd each.
+    """Returns independent smooth errors (r, t - 1, p, 2) [m] of the displacements, of one sd each.
 
     gauge_m : distance between the pads
     """
@@ -45,7 +65,7 @@ def displacement_errors(
     shapes = []
     for component in range(2):
         covariance = _symmetric(markers.reference_m, settings.length * gauge_m, component)
-        covariance *= settings.share**2 / np.mean(np.diag(covariance))
+        covariance *= settings.smooth**2 / np.mean(np.diag(covariance))
         last = len(covariance) - 1
         first = max(last + 1 - settings.shapes, 0)
         variance, vectors = eigh(covariance, subset_by_index=[first, last])

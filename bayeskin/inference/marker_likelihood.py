@@ -2,15 +2,15 @@
 
 The displacements of the visible points in an image, since the first image, are
 
-    d = u(theta) + E z + B c + e ,   e ~ N(0, s^2 I) ,   c ~ N(0, S) ,   z ~ N(0, I)
+    d = u(theta) + m + E z + B c + e ,   e ~ N(0, s^2 I) ,   c ~ N(0, S) ,   z ~ N(0, I)
 
-where u is the model's displacement, the columns of E are its errors, and the three columns of B are a unit
-translation along x, one along y, and a unit rotation about the origin. The motion c of the camera is not
-known. It is integrated out, with its prior covariance S = diag(t^2, t^2, r^2). With the singular value
-decomposition of B S^(1/2), the inverse and the determinant of C = s^2 I + B S B' take a few sums for each
-image. The errors z are common to all images, and are integrated out too: the covariance of d - u over all
-images is C + E E' (Woodbury's identity, twice). A camera that may move far hides the mean displacement and
-the mean rotation of the points.
+where u is the model's displacement, m corrects it for the mesh, and the columns of E are its errors. The
+three columns of B are a unit translation along x, one along y, and a unit rotation about the origin. The
+motion c of the camera is not known. It is integrated out, with its prior covariance S = diag(t^2, t^2, r^2).
+With the singular value decomposition of B S^(1/2), the inverse and the determinant of C = s^2 I + B S B' take
+a few sums for each image. The errors z are common to all images, and are integrated out too: the covariance
+of d - u over all images is C + E E' (Woodbury's identity, twice). A camera that may move far hides the mean
+displacement and the mean rotation of the points.
 
 The noise is independent from image to image. The first image is the reference of image correlation, so its
 places count as exact.
@@ -28,10 +28,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.types import Array, Markers, Parameter, ParameterSpace
-
-MARKER_SD = "marker_sd"
-_SOURCE = "weakly informative: spans what image correlation of skin reaches"
+from bayeskin.types import Array, Markers, ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -60,15 +57,15 @@ class PredictsMarkers(Protocol):
 class MarkerLikelihood:
     """The tracks of markers with a model of them.
 
+    correction_m (t - 1, p, 2) : correction that is added to the model's displacements
     errors_m (r, t - 1, p, 2) : errors of the model's displacements, of one sd each
-    sd_m : bounds of the log-uniform prior of the noise's sd [m]; a known sd has bounds that are all but equal
     camera : prior sd of the camera's motion in each image
     """
 
     markers: Markers
     model: PredictsMarkers
+    correction_m: Array
     errors_m: Array
-    sd_m: tuple[float, float] = (1e-6, 1e-3)
     camera: CameraMotion = CameraMotion()
 
     @cached_property
@@ -80,11 +77,6 @@ class MarkerLikelihood:
     def _errors_along(self) -> Array:
         """Returns the errors' parts along the shapes of the camera's motion, (r, t - 1, 3)."""
         return np.einsum("rtq,tqc->rtc", self._errors, self._camera[0], optimize=True)
-
-    @property
-    def parameter(self) -> Parameter:
-        """Returns the parameter of the noise."""
-        return Parameter(MARKER_SD, "m", *self.sd_m, "log-uniform", "noise sd of the markers", _SOURCE)
 
     @cached_property
     def _seen(self) -> Array:
@@ -106,6 +98,10 @@ class MarkerLikelihood:
         visible = self._seen[:, :, None] * shapes.reshape(-1, 3)
         left, size, _ = np.linalg.svd(visible, full_matrices=False)
         return left, size**2
+
+    def predict_m(self, theta: Array, names: tuple[str, ...]) -> Array:
+        """Returns corrected displacements (n, t - 1, p, 2) [m] at parameters (n, D) of these names."""
+        return np.asarray(self.model.predict_m(self.columns(theta, names)) + self.correction_m)
 
     def columns(self, theta: Array, names: tuple[str, ...]) -> Array:
         """Returns the columns of the model's parameters (n, d) among parameters (n, D) of these names."""
@@ -198,8 +194,8 @@ class MarkerLikelihood:
     @cached_property
     def identity(self) -> str:
         """Returns a hash of the tracks, their model and the priors."""
-        plain = [dict(self.model.provenance), self.sd_m, asdict(self.camera)]
+        plain = [dict(self.model.provenance), asdict(self.camera)]
         digest = hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode())
-        for array in (self.markers.time_s, self.markers.position_m, self.errors_m):
+        for array in (self.markers.time_s, self.markers.position_m, self.correction_m, self.errors_m):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()

@@ -21,7 +21,13 @@ from bayeskin.errors import InputError
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.marker_likelihood import MarkerLikelihood
 from bayeskin.inference.model_error import ModelError
-from bayeskin.inference.noise_model import NoiseChain, NoisePriors, noise_chain, noise_space
+from bayeskin.inference.noise_model import (
+    NoiseChain,
+    NoisePriors,
+    marker_noise,
+    noise_chain,
+    noise_space,
+)
 from bayeskin.types import (
     POINTS_AT_ONCE,
     Array,
@@ -104,7 +110,7 @@ class LogPosterior:
     @cached_property
     def _noise_parameters(self) -> tuple[Parameter, ...]:
         of_force = noise_space(self.chain.kinds, self.noise_priors).parameters
-        return of_force if self.markers is None else (*of_force, self.markers.parameter)
+        return of_force if self.markers is None else (*of_force, marker_noise(self.noise_priors))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -203,7 +209,7 @@ class LogPosterior:
     def predict_markers(self, theta: Array) -> Array:
         """Returns the markers' displacements (n, t - 1, p, 2) [m] at SI values (n, D) or (n, d)."""
         assert self.markers is not None
-        return self.markers.model.predict_m(self.markers.columns(theta, self.surrogate.space.names))
+        return self.markers.predict_m(theta, self.surrogate.space.names)
 
     def impossible(self, theta: Array, prediction: Prediction) -> NDArray[np.bool_]:
         """Returns which rows (n, D) in SI `excludes` or `sure_within_n` rules out, given the prediction."""

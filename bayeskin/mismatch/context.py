@@ -14,8 +14,7 @@ from bayeskin.forward.observed import FullForce
 from bayeskin.forward.posterior import marker_likelihood, posterior_of
 from bayeskin.forward.reduced import ReducedForward
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.marker_likelihood import MARKER_SD
-from bayeskin.inference.noise_model import ALL, noise_space
+from bayeskin.inference.noise_model import ALL, MARKER_SD, noise_space
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
 from bayeskin.mechanisms.each_recording import in_each_recording, in_one_recording
 from bayeskin.mechanisms.mechanism import Tissue

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayeskin.inference.marker_likelihood import MARKER_SD
+from bayeskin.inference.noise_model import MARKER_SD
 from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, PadMotion
 

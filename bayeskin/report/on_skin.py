@@ -98,7 +98,7 @@ def _draw_strain(figure: Figure, ax: Axes, located: _OnSkin, component: int) -> 
         ax.text(0.5, 0.5, "too few points", transform=ax.transAxes, ha="center", color=GREY)
         return
     limit = max(float(np.quantile(np.abs(strain), 0.98)), 1e-3)
-    size = 2500.0 / max(len(strain), 25)
+    size = 4500.0 / max(len(strain), 25)
     x_mm, y_mm = 1e3 * located.place_m.T
     dots = ax.scatter(
         x_mm, y_mm, size, strain, marker="s", lw=0, cmap="RdBu_r", vmin=-limit, vmax=limit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,8 @@ class Markers(FreezesArrays):
     position_m : positions, (t, p, 2); NaN where a point was not seen
     points : the name of each point, (p,)
     sha256 : hash of the source file's bytes
+    mesh_change_m : change of the full model's displacements from its coarse mesh to its usual one,
+        (t - 1, p, 2); empty until a run of the full model has shown it
     """
 
     time_s: Array
@@ -27,6 +29,7 @@ class Markers(FreezesArrays):
     points: tuple[str, ...]
     name: str
     sha256: str
+    mesh_change_m: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -45,14 +46,20 @@ def likelihood_of_markers(
     provenance = {"design_seed": design.seed, "model_hash": design.model_hash, "runs": int(ok.sum())}
     surrogate = train_marker_surrogate(design.space, theta[ok], moved_m[ok], weights[ok], provenance)
     run.reporter.log(f"markers: {ok.sum()} runs, error {1e6 * surrogate.rms_error_m:.2f} µm RMS")
-    likelihood = marker_likelihood(markers, surrogate, model_spec(run), motion)
+    spec = replace(model_spec(run), refinement=load_reduced(_file(run)).refinement)
+    likelihood = marker_likelihood(markers, surrogate, spec, motion)
     return replace(likelihood, errors_m=np.concatenate([likelihood.errors_m, surrogate.errors_m]))
+
+
+def _file(run: Run) -> Path:
+    """Returns the file of the device's reduced model. Raises InputError where there is none."""
+    return reduced_file(run.config.geometry(run.config_path).geometry, [run.config_path])
 
 
 def _runs(run: Run, markers: Markers, motion: PadMotion, points: list[dict[str, float]]) -> Array:
     """Returns displacements (n, t - 1, p, 2) [m] at points; NaN where a run failed. No run is made twice."""
     geometry = run.config.geometry(run.config_path).geometry
-    file = reduced_file(geometry, [run.config_path])
+    file = _file(run)
     runs = MarkerRuns(file, geometry, motion, markers)
     computed_from = [load_reduced(file).hash, geometry.hash, vars(motion), vars(markers)]
     unknown = np.full((len(markers.time_s) - 1, len(markers.points), 2), np.nan)

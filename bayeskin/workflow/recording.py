@@ -14,6 +14,7 @@ from bayeskin import report, storage
 from bayeskin.config import RecordingConfig
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec
+from bayeskin.finite_element.mesh_change import mesh_change
 from bayeskin.finite_element.surface_points import refuse_outside
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.recordings import (
@@ -100,7 +101,7 @@ def _prepare_recordings(run: Run) -> Mapping[str, Any]:
         motion = join_motions([part.motion for part in parts], spans)
         binned = join_bins([part.binned for part in parts], spans)
     _refuse_empty_windows(run, binned)
-    markers = _markers(run, samples)
+    markers = _markers(run, samples, motion)
     storage.save(run.at("recording", "recording.h5"), samples)
     if markers is not None:
         storage.save(run.at("recording", MARKERS), markers)
@@ -115,9 +116,10 @@ def _prepare_recordings(run: Run) -> Mapping[str, Any]:
     return {**facts[0], "name": samples.name, "sha256": samples.sha256, **total, "recordings": facts}
 
 
-def _markers(run: Run, recording: Recording) -> Markers | None:
+def _markers(run: Run, recording: Recording, motion: PadMotion) -> Markers | None:
     """Returns the tracks of points that belong to the recording, or None where there are none.
 
+    Two runs of the full model show by how much a finer mesh changes their displacements.
     Raises InputError for tracks of another test, and for points outside the skin of the device.
     """
     file = run.config.each_recording[0].markers
@@ -126,7 +128,9 @@ def _markers(run: Run, recording: Recording) -> Markers | None:
     markers = read_markers(run.beside(file), recording)
     geometry = run.config.geometry(run.config_path).geometry
     refuse_outside(geometry, markers.reference_m, str(run.beside(file)))
-    return markers
+    run.reporter.log("markers: two runs of the full model show the error of its mesh")
+    change_m = mesh_change(replace(run.config.model.spec(), geometry=geometry), motion, markers)
+    return replace(markers, mesh_change_m=change_m)
 
 
 def recorded_markers(folder: Path) -> Markers | None:
@@ -165,5 +169,10 @@ def _files(run: Run) -> Iterable[Path]:
 
 
 STAGE = Stage(
-    "recording", "reads the recordings", (), ("recording", "model", "fit"), _prepare_recordings, _files
+    "recording",
+    "reads the recordings",
+    (),
+    ("recording", "model", "fit", "device", "tissue"),
+    _prepare_recordings,
+    _files,
 )
