@@ -124,11 +124,11 @@ def _write_tracks(file: Path, time_s: Array, position_mm: Array, points: np.ndar
                     out.write(f"{at_s:.4f},{point},{x:.5f},{y:.5f}\n")
 
 
-def opened(recording: Path, markers: Path, folder: Path) -> DiagnosisContext:
+def opened(recording: Path, table: Path, folder: Path) -> DiagnosisContext:
     """Imports a recording with its tracks, and returns the context of its diagnosis."""
     folder.mkdir()
     out = folder / "arm.h5"
-    import_recording(rows.Log(), recording, out, zero=True, markers=markers)
+    import_recording(rows.Log(), recording, out, zero=True, markers=table)
     samples = storage.load(out, Recording)
     phases = segment(samples)
     motion = idealised_motion(samples, phases)
