@@ -16,11 +16,13 @@ test: $(VENV)/.installed-dev
 	$(VENV)/bin/mypy
 	$(VENV)/bin/python -m pytest -n 2 --dist loadfile
 
-# Editable, so that what stands in the checkout is what runs; made again when the dependencies change.
+# Editable, so that what stands in the checkout is what runs; made again when the dependencies change. `doctor`
+# compiles the models, so that no later command has to.
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit("bayeskin needs Python 3.11 or newer: make PYTHON=python3.11 ..." if sys.version_info < (3, 11) else 0)'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --editable .
+	$(VENV)/bin/bayeskin doctor
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed

@@ -22,7 +22,7 @@ from bayeskin.design import default_space
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.forward.interface import change
 from bayeskin.mechanisms import catalogue
-from bayeskin.reduced import kernels
+from bayeskin.reduced import kernels, newton
 from bayeskin.reduced.arrays import History
 from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.files import load_reduced
@@ -70,7 +70,7 @@ def row(label: str, eq: ReducedEquations, p_init: float) -> list[str]:
     scratch, output, t = eq.make_room(), np.empty(len(state.x)), eq.tangent
     residual = median_ms(lambda: kernels.residual(eq.system, eq.packed, past, state.x, scratch, output))
     tangent = median_ms(
-        lambda: kernels.renew(
+        lambda: newton.renew(
             eq.system, eq.packed, past, state.x, scratch, t.inverse, t.force_row, t.by_pads
         )
     )  # fmt: skip

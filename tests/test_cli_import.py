@@ -59,11 +59,11 @@ def test_the_text_has_the_answer_and_stderr_what_was_taken_for_what(
         (["--unit", "mass=kg"], ["'mass'", "one of time, displacement, force"]),
         (["--unit", "force=psi"], ["--unit force=psi", "the unit 'psi'", "N, kN"]),
         (["--unit", "force=--N"], ["the unit '-N'"]),
-        (["--unit", "force=N", "--unit", "force=mN"], ["once for a quantity"]),
+        (["--unit", "force=N", "--unit", "force=mN"], ["once for each quantity"]),
         (["--time", "9"], ["--time 9", "1 'clock', 2 'pull', 3 'cell'", "a number from 1 to 3"]),
         (["--force", "load"], ["--force load", "3 'cell'"]),
-        (["--time", "1", "--displacement", "2", "--force", "3"], ["without a known unit", "--unit time"]),
-        (["--sheet", "7"], ["the tables ['1']", "a sheet '7'"]),
+        (["--time", "1", "--displacement", "2", "--force", "3"], ["is not known", "--unit time"]),
+        (["--sheet", "7"], ["no sheet or table '7'", "use one of '1'"]),
     ],
 )  # fmt: skip
 def test_a_statement_that_does_not_fit_is_refused(
@@ -124,7 +124,7 @@ def test_names_that_are_not_utf8_are_read_and_written(bayeskin: Command, tmp_pat
     assert said.splitlines()[-1].endswith("r\\xe9sultat.h5")
     assert len(storage.load(out, Recording).time_s) == len(TIME_S)
     assert_refused(
-        bayeskin("new", source, "-o", tmp_path / "c.toml"), "a name that a configuration cannot contain"
+        bayeskin("new", source, "-o", tmp_path / "c.toml"), "a configuration cannot contain this name"
     )
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections import namedtuple
@@ -14,20 +16,20 @@ from typing import Any
 import pytest
 
 from bayeskin import cli
-from bayeskin.workflow import doctor
+from bayeskin.workflow import doctor, doctor_models
+from bayeskin.workflow.engine import Silent
 
-TESTS = ("full_model_finding", "surrogate_finding")
+MODELS = ["reduced model", "full model", "posterior", "surrogate"]
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leaves out the runs of the models."""
-    for name in TESTS:
-        monkeypatch.setattr(doctor, name, lambda: doctor.Finding("model", True, "as stored"))
+    monkeypatch.setattr(doctor, "findings_of_models", lambda reporter: [])
 
 
 def broken(said: dict[str, Any]) -> dict[str, str]:
-    return {finding["name"]: finding["found"] for finding in said["findings"] if not finding["ok"]}
+    return {finding["name"]: finding["state"] for finding in said["findings"] if not finding["ok"]}
 
 
 def test_the_models_give_the_stored_numbers_here(
@@ -41,21 +43,64 @@ def test_the_models_give_the_stored_numbers_here(
     assert broken(said) == {}
     assert (said["ok"], end.value.code) == (True, 0)
     names = [finding["name"] for finding in said["findings"]]
-    expected = ["numpy", "linear solver", "threads", "disk space", "write access", "full model", "surrogate"]
+    expected = ["numpy", "linear solver", "threads", "disk space", "write access", *MODELS]
     assert [name for name in names if name in expected] == expected
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("number", "name"), [("FULL_MODEL_N", "full model"), ("SURROGATE_N", "surrogate")], ids=str
-)
+NUMBERS = ["REDUCED_MODEL_N", "FULL_MODEL_N", "POSTERIOR_NATS", "SURROGATE_N"]
+
+
+@pytest.mark.parametrize(("number", "name"), list(zip(NUMBERS, MODELS, strict=True)), ids=str)
 def test_a_model_that_gives_another_number_is_broken(
     monkeypatch: pytest.MonkeyPatch, number: str, name: str
 ) -> None:
-    monkeypatch.setattr(doctor, number, 1.01 * getattr(doctor, number))
-    finding = {"full model": doctor.full_model_finding, "surrogate": doctor.surrogate_finding}[name]()
+    monkeypatch.setattr(doctor_models, number, 1.01 * getattr(doctor_models, number))
+    finding = doctor_models.CHECKS[name]()
     assert (finding.name, finding.ok) == (name, False)
-    assert "within" in finding.advice
+    assert "within" in finding.needed
+
+
+USES = """
+import numpy as np
+from numba.core import event
+from toys.inference_problems import toy_problem
+from bayeskin.mechanisms import catalogue
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.shipped import shipped
+from bayeskin.types import PadMotion
+from bayeskin.workflow.doctor_models import THETA
+from bayeskin.workflow.reducing import SHIPPED
+
+class Compiled(event.Listener):
+    def on_start(self, told):
+        name = getattr(told.data["dispatcher"], "__module__", "")
+        if name.startswith("bayeskin"):
+            print(name, told.data["dispatcher"].__name__)
+    def on_end(self, told): pass
+
+event.register("numba:compile", Compiled())
+problem = toy_problem()
+problem.log_prob(np.random.default_rng(1).uniform(*problem.bounds, (3, problem.dim)))
+solid = catalogue()["solid-viscoelasticity"]
+values = THETA | solid.neutral
+pulled = PadMotion(np.array([0.0, 2.0, 4.0]), np.array([0.0, 3e-3, 0.0]))
+model = load_reduced(shipped(SHIPPED))
+run = simulate_reduced(model, pulled, values, [solid], {"E_s": 1e4}, estimate=True)
+print("ended", run.status)
+"""
+
+
+@pytest.mark.slow  # compiles
+def test_after_it_inference_and_reduced_runs_compile_nothing(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-c", "from bayeskin.cli import main; main(['doctor'])"]
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    used = subprocess.run(
+        [sys.executable, "-c", USES], env=environment, check=True, capture_output=True, text=True
+    )
+    assert used.stdout.split("\n") == ["ended ok", ""]
 
 
 @pytest.mark.usefixtures("quick")
@@ -70,7 +115,7 @@ def test_a_package_that_is_absent_or_too_old_is_named(
     shown = capsys.readouterr().out
     assert end.value.code == 1
     assert "BROKEN  numpy" in shown
-    assert "expected >=99" in shown
+    assert "needed: >=99" in shown
     assert "BROKEN  no-such-package: not installed" in shown
     assert "ok      scipy" in shown
     assert "no-such-wheel" not in shown  # needed elsewhere only
@@ -83,7 +128,7 @@ def test_a_part_that_cannot_be_imported_is_a_finding_and_no_crash(
 ) -> None:
     monkeypatch.setattr(metadata, "requires", lambda name: [])
     monkeypatch.setitem(sys.modules, "bayeskin.finite_element", None)
-    said = doctor.examine(tmp_path)
+    said = doctor.examine(tmp_path, Silent())
     assert list(broken(said)) == ["linear solver"]
     assert "ModuleNotFoundError" in broken(said)["linear solver"]
 
@@ -98,9 +143,9 @@ def test_a_folder_without_room_or_access_is_told(tmp_path: Path, monkeypatch: py
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(tempfile, "TemporaryFile", denied)
-    assert broken(doctor.examine(tmp_path)) == {
+    assert broken(doctor.examine(tmp_path, Silent())) == {
         "disk space": "0.0 GB free",
-        "write access": f"{tmp_path}: Permission denied",
+        "write access": f"{tmp_path}: permission denied",
     }
 
 

@@ -59,7 +59,7 @@ def test_a_point_outside_the_skin_is_refused_in_one_line() -> None:
     problem = problem_of("bricks", 0, Geometry())
     across_m = half_extent(Geometry())[1]
     assert across_m < Geometry().box_m[1]  # the camera sees the projection of the arc
-    with pytest.raises(InputError, match=r"x 0 mm, y 57.* mm; expected points on the skin"):
+    with pytest.raises(InputError, match=r"x 0 mm, y 57.* mm is outside the skin"):
         surface_displacement(problem, np.array([[0.0, 0.0], [0.0, 1.001 * across_m]]))
 
 

@@ -93,8 +93,8 @@ def test_one_beside_the_source_goes_before_the_shipped_one(tmp_path) -> None:
     [
         ("[device]\ngauge_mm = 0.036\n", (), "0.036 mm"),
         ("[device]\nguard_mm = { gap = -1, width = 8 }\n", (), "inside the pad"),
-        ("[device]\nlength = 3\n", (), "unknown key"),
-        (NEAR, ("-o", "model.csv"), "ending .h5"),
+        ("[device]\nlength = 3\n", (), "this key is not known"),
+        (NEAR, ("-o", "model.csv"), "use .h5"),
         (None, (), "no such file"),
     ],
 )
@@ -133,7 +133,7 @@ def test_an_interrupted_building_goes_on_and_a_second_one_is_refused(
         built.append((settings.base_runs, "a run" in full.store))
         if not built[-1][1]:
             full.store.add("a run", {"message": ""})
-            with pytest.raises(InputError, match="in use by another bayeskin"):
+            with pytest.raises(InputError, match="another bayeskin"):
                 reducing.reduce(None, path, Silent())
             raise KeyboardInterrupt
         return model

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 
 DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -86,7 +86,8 @@ def exit_code(call: Callable[[], Any]) -> int:
     except (KeyboardInterrupt, click.Abort):
         return complain("interrupted; run the same command again to continue", INTERRUPTED)
     except OSError as error:
-        return complain(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT)
+        where = f"{error.filename}: " if error.filename else ""
+        return complain(f"{where}{reason_of(error)}", WRONG_INPUT)
 
 
 def complain(message: str, code: int) -> int:

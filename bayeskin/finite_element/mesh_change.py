@@ -32,8 +32,7 @@ def mesh_change(spec: ModelSpec, motion: PadMotion, markers: Markers) -> Array:
         finer = replace(spec, mesh="bricks", refinement=refinement)
         simulation = simulate(finer, motion, SKIN, on_state=tracks.on_state)
         if simulation.status != "ok":
-            raise InputError(
-                "markers", f"a failed run of the full model: {simulation.message}", "a finished run"
-            )
+            failed = f"the full model fails on {problem.mesh.name}: {simulation.message}"
+            raise InputError("markers", failed, "without its run the error of the mesh is not known")
         moved_m.append(tracks.since_first(simulation, markers.time_s))
     return np.asarray(moved_m[1] - moved_m[0])

@@ -50,11 +50,11 @@ def refuse_outside(lengths: Geometry, points_m: Array, where: str = "markers") -
     outside = np.flatnonzero((np.abs(points_m) > [along_m, across_m]).any(axis=1))
     if len(outside):
         x_mm, y_mm = 1e3 * points_m[outside[0]]
-        expected = (
-            f"points on the skin, up to {1e3 * along_m:.4g} mm along the pull and {1e3 * across_m:.4g} mm "
+        remedy = (
+            f"the modelled skin reaches {1e3 * along_m:.4g} mm along the pull and {1e3 * across_m:.4g} mm "
             "across it from the middle between the pads (is the device the right one?)"
         )
-        raise InputError(where, f"a point at x {x_mm:.4g} mm, y {y_mm:.4g} mm", expected)
+        raise InputError(where, f"a point at x {x_mm:.4g} mm, y {y_mm:.4g} mm is outside the skin", remedy)
 
 
 def half_extent(lengths: Geometry) -> tuple[float, float]:

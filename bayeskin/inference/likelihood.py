@@ -66,8 +66,10 @@ class ModeSearch(NamedTuple):
 ERROR_PRIOR, MODE_SEARCH = ErrorPrior(), ModeSearch()
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-# The helpers are inlined into `_kernel` before it is compiled. As separate functions, their sums would be
-# reordered differently in the process that compiles them and in one that loads them from numba's cache.
+# LLVM inlines every part into `_kernel`. As separate functions, their sums would be reordered differently in
+# the process that compiles them and in one that loads them from numba's cache. Each part is called in as few
+# places as possible, and copies arrays by loops, because the kernel takes long to compile.
+part = nb.njit(error_model="numpy", fastmath=_FAST, forceinline=True)
 
 
 def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> Array:
@@ -91,7 +93,7 @@ def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> A
     )
 
 
-_gains = nb.njit(fastmath=_FAST, inline="always")(filter_gains)
+_gains = part(filter_gains)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -114,7 +116,7 @@ def _kernel(
     return out
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _whiten(
     mean: Array, factor: Array, diagonal: Array, noise: Array,
     bins: NDArray[np.int64], force: Array, variance: Array, correlation: Array, gap: Array,
@@ -174,14 +176,18 @@ def _whiten(
     whole = bins[k - 1] - bins[0] == k - 1  # without a gap the bins are one slice, which is faster to copy
     for a in range(0, last, 4):
         for b in range(4):
-            row, target = factor[min(a + b, rank - 1)], work[4 + b]
+            target = work[4 + b]
+            if a + b >= rank:
+                for j in range(k):
+                    target[j] = 0.0
+                continue
+            row = factor[a + b]
             if whole:
-                target[:] = row[bins[0] : bins[0] + k]
+                for j in range(k):
+                    target[j] = row[bins[0] + j]
             else:
                 for j in range(k):
                     target[j] = row[bins[j]]
-            if a + b >= rank:
-                target[:] = 0.0
         _innovations(
             column1, column2, column3, column4, keep, keep_quick, of_memory, of_quick, inverse,
             design[a], design[a + 1], design[a + 2], design[a + 3],
@@ -189,7 +195,7 @@ def _whiten(
     return log_scale
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _innovations(
     column1: Array, column2: Array, column3: Array, column4: Array,
     keep: Array, keep_quick: Array, of_memory: Array, of_quick: Array, inverse: Array,
@@ -213,7 +219,7 @@ def _innovations(
         q1, q2, q3, q4 = q1 + h * e1, q2 + h * e2, q3 + h * e3, q4 + h * e4
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) -> float:
     """Returns the log of the integral over z of N(z; 0, I) prod_j t_nu(white_j - design[:, j] z).
 
@@ -221,74 +227,78 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
     converge too slowly.
     """
     gaussian = math.isinf(nu)
-    z, best, gradient, change = np.zeros(len(design)), np.zeros(rank), np.empty(rank), np.empty(rank)
-    gram, curvature = np.empty((len(design), len(design))), np.empty((rank, rank))
+    z, best, gradient = np.zeros(len(design)), np.zeros(rank), np.empty(rank)
+    gram, curvature, change = np.empty((len(design), len(design))), np.empty((rank, rank)), np.empty(rank)
     eps, pulled, bend = work[0], work[1], work[2]
     value, lowest, decrement = np.inf, np.inf, np.inf
-    for step in range(MODE_SEARCH.steps):
+    for step in range(MODE_SEARCH.steps + 1):
+        if step == MODE_SEARCH.steps:
+            for a in range(rank):
+                z[a] = best[a]
         value = _energy(white, design, rank, z, nu, eps)
-        if step == 1 and gaussian and np.all(np.abs(z) <= ERROR_PRIOR.farthest):
-            break  # the integrand is a normal density: one step is exact
-        before = decrement
+        if step == MODE_SEARCH.steps or (step == 1 and gaussian and _is_normal(z)):
+            break  # in the second case the integrand is a normal density: one step is exact
         if value <= lowest + 1e-9:
             lowest = value
-            best[:] = z[:rank]
+            for a in range(rank):
+                best[a] = z[a]
         elif step >= MODE_SEARCH.patient:
-            z[:rank] = best + (0.0 if step == MODE_SEARCH.patient else MODE_SEARCH.back) * (z[:rank] - best)
+            share = 0.0 if step == MODE_SEARCH.patient else MODE_SEARCH.back
+            for a in range(rank):
+                z[a] = best[a] + share * (z[a] - best[a])
             continue
-        _weights(eps, nu, step, step >= MODE_SEARCH.reweighted, pulled, bend)
-        _slope(design, z, pulled, gradient)
-        if step == 0:
-            _gram(design, bend, gram)
-        sound, decrement = _solved(gram, z, gradient, change, curvature)
-        if step > 0 and not gaussian and (not sound or decrement > MODE_SEARCH.slow * before):
-            _gram(design, bend, gram)
-            sound, decrement = _solved(gram, z, gradient, change, curvature)
-            if not sound:
-                _weights(eps, nu, step, False, pulled, bend)
+        before = decrement
+        for attempt in range(3):  # with an earlier curvature, with the present one, with a bound on it
+            if attempt != 1:
+                _weights(eps, nu, step, attempt == 0 and step >= MODE_SEARCH.reweighted, pulled, bend)
+            if attempt == 0:
+                _slope(design, z, pulled, gradient)
+            if attempt > 0 or step == 0:
                 _gram(design, bend, gram)
-                sound, decrement = _solved(gram, z, gradient, change, curvature)
+            sound = _factored(gram, z, curvature)
+            decrement = _solved(curvature, gradient, change) if sound else np.inf
+            slow = attempt == 0 and decrement > MODE_SEARCH.slow * before
+            if step == 0 or gaussian or (sound and not slow):
+                break
         if step > 0 and decrement < MODE_SEARCH.decrement:
             value -= 0.5 * decrement
             break
-        z[:rank] += change
-    else:
-        z[:rank] = best
-        value = _energy(white, design, rank, z, nu, eps)
-    if not gaussian:  # Laplace needs the density's own curvature, not that of a bound or of an earlier point
-        _weights(eps, nu, MODE_SEARCH.steps, True, pulled, bend)
+        for a in range(rank):
+            z[a] += change[a]
+    # Laplace needs the density's own curvature, not that of a bound or of an earlier point.
+    for attempt in range(0 if gaussian else 2):
+        _weights(eps, nu, MODE_SEARCH.steps, attempt == 0, pulled, bend)
         _gram(design, bend, gram)
-        if not _factored(gram, z, curvature):
-            _weights(eps, nu, MODE_SEARCH.steps, False, pulled, bend)
-            _gram(design, bend, gram)
-            _factored(gram, z, curvature)
+        if _factored(gram, z, curvature):
+            break
     for a in range(rank):
         value += math.log(curvature[a, a])
     return len(white) * _log_norm(nu) - value
 
 
-@nb.njit(fastmath=_FAST, inline="always")
-def _solved(gram: Array, z: Array, gradient: Array, change: Array, lower: Array) -> tuple[bool, float]:
-    """Fills `change` with Newton's step; returns whether the curvature is positive, and the decrement."""
-    if not _factored(gram, z, lower):
-        return False, np.inf
-    change[:] = gradient
-    return True, _solve(lower, change)
+@part
+def _is_normal(z: Array) -> bool:
+    """Returns whether the prior of the surrogate's error is a normal density at z."""
+    near = True
+    for a in range(len(z)):
+        near = near and abs(z[a]) <= ERROR_PRIOR.farthest
+    return near
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _log_norm(nu: float) -> float:
     if math.isinf(nu):
         return -0.5 * math.log(2.0 * math.pi)
     return math.lgamma(0.5 * (nu + 1.0)) - math.lgamma(0.5 * nu) - 0.5 * math.log(nu * math.pi)
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Array) -> float:
     """Returns minus the log of the integrand, without constants, and fills `eps` (k,)."""
     k = len(white)
-    eps[:] = white
     square = 0.0
+    for j in range(k):
+        eps[j] = white[j]
     for a in range(rank):
         beyond = max(abs(z[a]) - ERROR_PRIOR.farthest, 0.0)
         square += z[a] * z[a] + ERROR_PRIOR.stiff * beyond * beyond
@@ -309,15 +319,15 @@ def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Ar
     return 0.5 * square + 0.5 * (nu + 1.0) * (logs + math.log(product))
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _weights(eps: Array, nu: float, step: int, newton: bool, pulled: Array, bend: Array) -> None:
     """Fills the terms (k,) of the gradient, `pulled`, and of the curvature, `bend`.
 
     They are eps and 1 in the first step and for Gaussian noise.
     """
     if step == 0 or math.isinf(nu):
-        pulled[:] = eps
-        bend[:] = 1.0
+        for j in range(len(eps)):
+            pulled[j], bend[j] = eps[j], 1.0
         return
     for j in range(len(eps)):
         square = eps[j] * eps[j]
@@ -326,7 +336,7 @@ def _weights(eps: Array, nu: float, step: int, newton: bool, pulled: Array, bend
         bend[j] = weight * (nu - square) / (nu + square) if newton else weight
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _slope(design: Array, z: Array, pulled: Array, gradient: Array) -> None:
     """Fills `gradient` with G' pulled - z, and with the stiffer prior's pull beyond three sd."""
     for a in range(len(gradient)):
@@ -337,7 +347,7 @@ def _slope(design: Array, z: Array, pulled: Array, gradient: Array) -> None:
         gradient[a] = total - z[a] - math.copysign(ERROR_PRIOR.stiff * beyond, z[a])
 
 
-@nb.njit(fastmath=_FAST, inline="always")
+@part
 def _gram(design: Array, bend: Array, gram: Array) -> None:
     """Fills the lower triangle of G' diag(bend) G, eight entries at once."""
     k = len(bend)
@@ -362,7 +372,7 @@ def _gram(design: Array, bend: Array, gram: Array) -> None:
             gram[a + 1, b + 2], gram[a + 1, b + 3] = seventh, eighth
 
 
-@nb.njit(inline="always")
+@part
 def _factored(gram: Array, z: Array, lower: Array) -> bool:
     """Fills `lower` with the Cholesky factor of the gram matrix plus the prior's curvature.
 
@@ -384,17 +394,18 @@ def _factored(gram: Array, z: Array, lower: Array) -> bool:
     return True
 
 
-@nb.njit(inline="always")
-def _solve(lower: Array, vector: Array) -> float:
-    """Solves in place with the Cholesky factor; returns vector' matrix^-1 vector."""
-    rank, norm = len(vector), 0.0
+@part
+def _solved(lower: Array, gradient: Array, change: Array) -> float:
+    """Fills `change` with matrix^-1 gradient by the Cholesky factor; returns gradient' matrix^-1 gradient."""
+    rank, norm = len(change), 0.0
     for a in range(rank):
+        total = gradient[a]
         for b in range(a):
-            vector[a] -= lower[a, b] * vector[b]
-        vector[a] /= lower[a, a]
-        norm += vector[a] * vector[a]
+            total -= lower[a, b] * change[b]
+        change[a] = total / lower[a, a]
+        norm += change[a] * change[a]
     for a in range(rank - 1, -1, -1):
         for b in range(a + 1, rank):
-            vector[a] -= lower[b, a] * vector[b]
-        vector[a] /= lower[a, a]
+            change[a] -= lower[b, a] * change[b]
+        change[a] /= lower[a, a]
     return norm

@@ -49,7 +49,7 @@ def mesh_correction(
     Raises InputError for markers whose change from mesh to mesh is not known.
     """
     if not markers.mesh_change_m.size:
-        raise InputError("markers", "no change from mesh to mesh", "markers that a run has prepared")
+        raise InputError("markers", "the error of the mesh is not known", "a run must have prepared them")
     scaled_m = settings.shrinks ** (refinement - 1) * markers.mesh_change_m
     return settings.lacking * scaled_m, settings.sd * scaled_m
 

@@ -8,7 +8,6 @@ called the goodness-of-fit loss). Its probability is stated as the distance from
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +15,9 @@ from scipy.stats import chi2, norm
 
 from bayeskin.forward.interface import ModelRun
 from bayeskin.mismatch.context import DiagnosisContext
+from bayeskin.mismatch.search_context import for_task
 from bayeskin.mismatch.tasks import AnswerTasks, FitTask
 from bayeskin.mismatch.trust_region import SetFit
-from bayeskin.types import Array
 from bayeskin.types.joint import plain_name, recording_of, values_in
 
 RUNS = 6  # largest number of model runs of a fit to one recording
@@ -51,7 +50,7 @@ def agreements(ask: AnswerTasks, context: DiagnosisContext, joint: SetFit) -> li
     names, binned = joint.fit.names, context.binned
     tasks = [
         FitTask(
-            names, values_in(joint.fit.theta, number), RUNS, _part(joint.correction_n, bins), None, number
+            names, values_in(joint.fit.theta, number), RUNS, for_task(joint.correction_n[bins]), None, number
         )
         for number, bins in enumerate(binned.slices)
     ]
@@ -81,9 +80,3 @@ def _tension(context: DiagnosisContext, joint: SetFit, alone: SetFit, number: in
         {plain_name(name) for name in space.names if recording_of(name)}
     )
     return float(norm.isf(max(chi2.sf(max(loss, 0.0), shared), 1e-300)))
-
-
-def _part(values: Array, bins: slice) -> tuple[float, ...]:
-    """Returns a part of a correction in the form for tasks; empty for none."""
-    part: Sequence[float] = values[bins].tolist()
-    return tuple(part) if values[bins].any() else ()

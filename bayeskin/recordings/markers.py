@@ -18,7 +18,7 @@ from bayeskin.probe import bytes_of, refuse_damaged, refuse_endless
 from bayeskin.types import Array, Markers, Recording
 
 COLUMNS = ("time", "point", "x", "y")
-_EXPECTED = "the columns time (s), point, x (mm), y (mm), and no others"
+_REMEDY = "the table needs the columns time (s), point, x (mm), y (mm), and no others"
 _STORED = (".h5", ".hdf5")
 
 
@@ -57,7 +57,7 @@ def read_markers(path: Path | str, recording: Recording, start_s: float = 0.0) -
     path = Path(path)
     refuse_endless(path, "tracks of markers")
     if path.suffix.lower() in _STORED:
-        refuse_damaged(path, "a bayeskin Markers file")
+        refuse_damaged(path, "tracks in their own HDF5 form")
         markers = _checked_shapes(path, storage.load(path, Markers))
     else:
         markers = markers_of(str(path), bytes_of(path, "tracks of markers"), path.stem, start_s)
@@ -79,20 +79,20 @@ def markers_of(where: str, data: bytes, name: str, start_s: float = 0.0) -> Mark
         (len(points), TRACKS.points, "points"),
     ):
         if count < least:
-            raise InputError(where, f"{count} {what}", f"at least {least}")
+            raise InputError(where, f"the number of {what} is {count}", f"it must be at least {least}")
     of_time = {time_s: number for number, time_s in enumerate(times)}
     of_point = {point: number for number, point in enumerate(points)}
     position_m = np.full((len(times), len(points), 2), np.nan)
     for row, time_s, point, xy_mm in rows:
         cell = position_m[of_time[time_s], of_point[point]]
         if np.isfinite(cell[0]):
-            problem = f"point {point!r} twice at {number(time_s, 6)} s"
-            raise InputError(f"{where}, row {row}", problem, "a point once at each time")
+            problem = f"point {point!r} is there twice at {number(time_s, 6)} s"
+            raise InputError(f"{where}, row {row}", problem, "each point may have one row at each time")
         cell[:] = 1e-3 * np.array(xy_mm)
     lost = np.flatnonzero(~np.isfinite(position_m[0, :, 0]))
     if len(lost):
-        problem = f"no position of point {points[lost[0]]!r} at the first time, {number(times[0], 6)} s"
-        raise InputError(where, problem, "every point at the first time, because it gives the place at rest")
+        problem = f"point {points[lost[0]]!r} has no row at the first time, {number(times[0], 6)} s"
+        raise InputError(where, problem, "every point needs its place at rest, which this time gives")
     shifted_s = np.array(times) - start_s
     return Markers(shifted_s, position_m, tuple(points), name, hashlib.sha256(data).hexdigest())
 
@@ -102,9 +102,9 @@ def _rows(where: str, data: bytes) -> Iterator[tuple[int, float, str, tuple[floa
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(where, "bytes that are not UTF-8", f"a text with {_EXPECTED}") from None
+        raise InputError(where, "its bytes are no text in UTF-8", _REMEDY) from None
     if "\0" in text:
-        raise InputError(where, "bytes that are not text", f"a text with {_EXPECTED}")
+        raise InputError(where, "its bytes are no text", _REMEDY)
     first = text.partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
     reader = csv.reader(io.StringIO(text), delimiter=delimiter)
@@ -115,18 +115,18 @@ def _rows(where: str, data: bytes) -> Iterator[tuple[int, float, str, tuple[floa
             if any(cell.strip() for cell in cells):
                 yield (row, *_numbers(f"{where}, row {row}", cells, places))
     except csv.Error as error:
-        raise InputError(where, f"a table that cannot be read ({error})", _EXPECTED) from None
+        raise InputError(where, f"the table cannot be read ({error})", _REMEDY) from None
 
 
 def _places(where: str, header: Sequence[str]) -> dict[str, int]:
     """Returns the place of each column. Raises InputError for unknown, double or missing columns."""
     unknown = [name for name in header if name not in COLUMNS]
     if unknown:
-        raise InputError(where, f"the unknown column {unknown[0][:40]!r}", _EXPECTED)
+        raise InputError(where, f"the column {unknown[0][:40]!r} is unknown", _REMEDY)
     for name in COLUMNS:
         if header.count(name) != 1:
-            problem = f"no column {name!r}" if name not in header else f"the column {name!r} twice"
-            raise InputError(where, problem, _EXPECTED)
+            problem = f"the column {name!r} is {'missing' if name not in header else 'there twice'}"
+            raise InputError(where, problem, _REMEDY)
     return {name: header.index(name) for name in COLUMNS}
 
 
@@ -135,7 +135,7 @@ def _numbers(
 ) -> tuple[float, str, tuple[float, float]]:
     """Returns time [s], point and position [mm] of a row."""
     if len(cells) != len(COLUMNS):
-        raise InputError(where, f"{len(cells)} cells", f"{len(COLUMNS)} cells")
+        raise InputError(where, f"the number of cells is {len(cells)}", f"it must be {len(COLUMNS)}")
     values = {}
     for name in ("time", "x", "y"):
         cell = cells[places[name]].strip()
@@ -144,14 +144,14 @@ def _numbers(
         except ValueError:
             values[name] = np.nan
         if not np.isfinite(values[name]):
-            expected = "a finite number with a decimal point; leave the row out where a point is not seen"
-            raise InputError(where, f"{cell[:40]!r} in column {name!r}", expected)
+            problem = f"{cell[:40]!r} in column {name!r} is no finite number"
+            raise InputError(where, problem, "leave out the row where a point is not seen")
         if name != "time" and abs(values[name]) > 1e3 * TRACKS.largest_m:
-            expected = f"at most {1e3 * TRACKS.largest_m:g} mm from the middle between the pads"
-            raise InputError(where, f"{name} = {number(values[name], 4)}", expected)
+            remedy = f"it must be at most {1e3 * TRACKS.largest_m:g} mm from the middle between the pads"
+            raise InputError(where, f"{name} is {number(values[name], 4)} mm", remedy)
     point = cells[places["point"]].strip()
     if not point:
-        raise InputError(where, "an empty cell in column 'point'", "the name of a point")
+        raise InputError(where, "the cell in column 'point' is empty", "each row needs the name of a point")
     return values["time"], point, (values["x"], values["y"])
 
 
@@ -159,18 +159,18 @@ def refuse_other_test(where: str, markers: Markers, recording: Recording) -> Non
     """Raises InputError for tracks that lie outside a recording's time, do not cover it, or jump."""
     first_s, last_s, end_s = float(markers.time_s[0]), float(markers.time_s[-1]), float(recording.time_s[-1])
     if first_s < -TRACKS.beyond_s or last_s > end_s + TRACKS.beyond_s:
-        problem = f"images from {number(first_s, 5)} to {number(last_s, 5)} s on the recording's time"
-        expected = f"images within the recording, 0 to {number(end_s, 5)} s, with the clock of its file"
-        raise InputError(where, problem, expected)
+        problem = f"the images are from {number(first_s, 5)} to {number(last_s, 5)} s on the recording's time"
+        remedy = f"they must lie within 0 to {number(end_s, 5)} s, on the clock of the recording's file"
+        raise InputError(where, problem, remedy)
     if last_s - first_s < TRACKS.covered * end_s:
-        problem = f"images that cover {number(last_s - first_s, 5)} s of {number(end_s, 5)} s"
-        raise InputError(where, problem, f"images over at least {TRACKS.covered:.0%} of the recording's time")
+        problem = f"the images cover {number(last_s - first_s, 5)} s of {number(end_s, 5)} s"
+        raise InputError(where, problem, f"they must cover at least {TRACKS.covered:.0%} of the recording")
     opening_m = np.abs(recording.displacement_m - recording.displacement_m[0])
     before = recording.time_s <= max(first_s, 0.0)
     opened = float(opening_m[before].max() / opening_m.max())
     if opened > TRACKS.rest:
-        problem = f"a first image after the pads have opened by {opened:.0%} of their largest opening"
-        raise InputError(where, problem, "a first image before the test, which gives the places at rest")
+        problem = f"before the first image the pads have opened by {opened:.0%} of their largest opening"
+        raise InputError(where, problem, "the first image must show the places at rest")
     _refuse_jumps(where, markers, recording)
 
 
@@ -187,11 +187,11 @@ def _refuse_jumps(where: str, markers: Markers, recording: Recording) -> None:
         if len(step_m) and step_m[worst] > allowed_m[worst] + TRACKS.jump_m:
             at_s = number(float(markers.time_s[seen[worst + 1]]), 6)
             problem = f"point {name!r} moves {number(1e3 * step_m[worst])} mm from the others up to {at_s} s"
-            expected = (
-                f"at most {1e3 * TRACKS.jump_m:g} mm beyond the {number(1e3 * allowed_m[worst])} mm by which "
-                "the pads move; leave out the rows where the track is lost"
+            remedy = (
+                f"skin moves at most {1e3 * TRACKS.jump_m:g} mm more than the pads, which move "
+                f"{number(1e3 * allowed_m[worst])} mm: leave out the rows where the track is lost"
             )
-            raise InputError(where, problem, expected)
+            raise InputError(where, problem, remedy)
 
 
 def _pulled(time_s: Array, recording: Recording) -> Array:
@@ -217,5 +217,5 @@ def _checked_shapes(path: Path, markers: Markers) -> Markers:
         and bool(np.all(np.isfinite(markers.position_m[0])))
     )
     if not valid:
-        raise InputError(path, "arrays that do not fit together", "a file that bayeskin import wrote")
+        raise InputError(path, "its arrays do not fit together", "bayeskin import must write it again")
     return markers

@@ -118,7 +118,7 @@ def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Mo
     """
     finished = [run for run in map(full.read, cases) if not run.message]
     if not finished:
-        raise InputError(full.store.path, "no full run that finished", "at least one")
+        raise InputError(full.store.path, "no full run has finished", "at least one must finish")
 
     def weighted(name: str, product: sp.csr_matrix) -> Array:
         rows = np.concatenate([getattr(run, name) for run in finished]).astype(float)
@@ -167,13 +167,16 @@ class Teacher:
             runs: dict[int, Taken] = {}
             for number, run in run_all(replace(self, known=rule), items):
                 if isinstance(run, Lost):
-                    raise InputError(self.label, run.reason, "a worker that finishes a reduced run")
+                    raise InputError(self.label, run.reason, "run the same command again")
                 runs[number] = run
                 progress(self.label, (done + len(runs)) / len(cases))
             rows += [runs[number].rows for number in sorted(runs) if self._is_near(runs[number])]
             if not rows:
-                message = "no reduced run close to the full model"
-                raise InputError(self.label, message, "parameters without folding of the skin")
+                raise InputError(
+                    self.label,
+                    "no reduced run is close to the full model",
+                    "use parameters with which the skin does not fold",
+                )
             all_rows = with_volumes(np.concatenate(rows), at, self.settings.cubature)
             rule = choose_points(all_rows, [points], self.settings.cubature)[points][0]
             done = end

@@ -13,7 +13,7 @@ from bayeskin.finite_element.problem import nominal_force
 from bayeskin.finite_element.series import SeriesSolver, Solved, on_the_way
 from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.finite_element.tissue import Bind
-from bayeskin.reduced import kernels
+from bayeskin.reduced import kernels, newton
 from bayeskin.reduced.arrays import History, Room, System
 from bayeskin.reduced.binding import bound, exact_units, packed
 from bayeskin.reduced.operators import ReducedSpace
@@ -187,7 +187,7 @@ class ReducedEquations:
     def _renew_tangent(self, past: History, x: Array) -> None:
         """Computes a new tangent for a stage, at the unknowns x."""
         t = self.tangent
-        kernels.renew(self.system, self.packed, past, x, self.make_room(), t.inverse, t.force_row, t.by_pads)
+        newton.renew(self.system, self.packed, past, x, self.make_room(), t.inverse, t.force_row, t.by_pads)
         self.spent[2] += 1
 
     def _solve(self, past: History, guess: Array, pads_m: float) -> Solved | None:
@@ -197,11 +197,11 @@ class ReducedEquations:
         """
         t, room, x = self.tangent, self.make_room(), guess.copy()
         x[0], x[1] = pads_m, 0.0
-        status, force_n = kernels.solve(
+        status, force_n = newton.solve(
             self.system, self.packed, past, x, SOLVER_TOLERANCE, self._nominal_n, room, t.inverse,
             t.force_row, t.by_pads, self.spent,
         )  # fmt: skip
-        if status != kernels.CONVERGED:
+        if status != newton.CONVERGED:
             self._tangents.forget()  # the next solve then computes a new tangent
             return None
         self.room, self.past = room, past

@@ -1,4 +1,4 @@
-"""Compiled core of the reduced model: residual, tangent and the whole solve of a stage at weighted points.
+"""Compiled core of the reduced model: the residual and the tangent of a stage, summed over weighted points.
 
 The unknowns are the coefficients x = (d, 0, displacement modes, pressure modes), where d is the displacement
 of the pads. The second entry is always zero. It belongs to the dual field, whose row of the residual is half
@@ -8,6 +8,8 @@ iterations runs in Python.
 The part of the base law that is linear at rest is integrated exactly. `System.solid`, `coupling` and `flow`
 hold the difference between its integral over all points and its integral over the chosen points. This
 difference corrects the sum over the chosen points.
+
+Loops over entries take the place of assignments and expressions of whole arrays, which numba compiles slowly.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -19,11 +21,8 @@ from bayeskin.finite_element import poroelastic
 from bayeskin.finite_element.assembly import compiled
 from bayeskin.reduced.calls import call_linearise, call_respond
 
-CONVERGED, INSIDE_OUT, SLOW, NOT_FINITE = range(4)
-MOST_ITERATIONS, MOST_RENEWALS = 60, 12
-SLOW_CONTRACTION = 0.6  # ratio of two steps above which a new tangent, as costly as twenty residuals, is made
-SMALLEST_DAMPING = 1e-3
 BLOCK = 16  # number of points whose modes fit into the first-level cache
+FIRST = np.int64(0)  # the first point; for a plain 0, numba would compile the functions once more
 
 
 @compiled
@@ -33,53 +32,54 @@ def residual(system, laws, past, x, room, out):
     A point is inside out where J is not positive. The residual is then incomplete.
     """
     n, k = system.weight.shape[0], system.gradient.shape[2]
-    m = system.pressure.shape[1]
     out[:] = 0.0
     smallest = np.inf
     for start in range(0, n, BLOCK):
         end = min(start + BLOCK, n)
-        _kinematics(system, x, start, end, room)
+        fill_kinematics(system, x, start, end, room)
         least = answer(system, laws, past, start, end, room)
         if not least > 0.0:
             return least
         smallest = min(smallest, least)
         _project(system, start, end, room, out)
-    force, fluid = x[:k], x[k:]
+    moved = x[:k].copy()
     for i in range(k):
-        total = 0.0
-        for j in range(k):
-            total += system.solid[i, j] * force[j]
-        for j in range(m):
-            total += system.coupling[i, j] * fluid[j]
-        out[i] += total
-    for i in range(m):
-        total = 0.0
-        for j in range(m):
-            total += system.flow[i, j] * fluid[j]
-        total *= past.length_s
-        for j in range(k):
-            total += system.coupling[j, i] * (force[j] - past.displacement[j])
-        out[k + i] += total
+        moved[i] -= past.displacement[i]
+    add_linear(system, x, moved, past.length_s, out)
     return smallest
 
 
 @compiled
-def _kinematics(system, x, start, end, room):
+def add_linear(system, x, moved, length_s, out):
+    """Adds the exactly integrated part to the residual; moved (k,) is the change of the displacement."""
+    k, m = system.gradient.shape[2], system.pressure.shape[1]
+    fields, pressures = x[:k], x[k:]
+    for i in range(k):
+        out[i] += product(system.solid[i], fields) + product(system.coupling[i], pressures)
+    for i in range(m):
+        total = length_s * product(system.flow[i], pressures)
+        for j in range(k):
+            total += system.coupling[j, i] * moved[j]
+        out[k + i] += total
+
+
+@compiled
+def fill_kinematics(system, x, start, end, room):
     """Fills F, p and grad p at the points from `start` to `end`."""
     k = system.gradient.shape[2]
     fields, pressures = x[:k], x[k:]
     for q in range(start, end):
         for i in range(3):
             for j in range(3):
-                room.deformation[q, i, j] = _product(system.gradient[q, 3 * i + j], fields)
+                room.deformation[q, i, j] = product(system.gradient[q, 3 * i + j], fields)
             room.deformation[q, i, i] += 1.0
-        room.at_pressure[q] = _product(system.pressure[q], pressures)
+        room.at_pressure[q] = product(system.pressure[q], pressures)
         for i in range(3):
-            room.at_slope[q, i] = _product(system.slope[q, i], pressures)
+            room.at_slope[q, i] = product(system.slope[q, i], pressures)
 
 
 @compiled
-def _product(left, right):
+def product(left, right):
     total = 0.0
     for c in range(len(left)):
         total += left[c] * right[c]
@@ -89,7 +89,14 @@ def _product(left, right):
 @compiled
 def answer(system, laws, past, start, end, room):
     """Fills stress, content, flux, J and memory at points `start` to `end`; returns the smallest J."""
-    smallest = _base(system, past, start, end, room)
+    smallest = poroelastic.respond(
+        _cells_of_matrices(room.deformation, start, end), _cells(room.at_pressure, start, end),
+        _cells_of_vectors(room.at_slope, start, end), system.mu[start:end], system.lam[start:end],
+        system.mobility[start:end], system.storage[start:end], past.length_s,
+        _cells(past.volume, start, end), _cells(past.pressure, start, end),
+        _cells_of_matrices(room.stress, start, end), _cells(room.content, start, end),
+        _cells_of_vectors(room.flux, start, end), _cells(room.volume, start, end),
+    )  # fmt: skip
     if not smallest > 0.0:
         return smallest
     for law in range(len(laws.respond)):
@@ -104,17 +111,19 @@ def answer(system, laws, past, start, end, room):
 
 
 @compiled
-def _base(system, past, start, end, room):
-    """Fills the response of the base law at the points from `start` to `end`; returns the smallest J."""
-    e = end - start
-    return poroelastic.respond(
-        room.deformation[start:end].reshape(e, 1, 3, 3), room.at_pressure[start:end].reshape(e, 1),
-        room.at_slope[start:end].reshape(e, 1, 3), system.mu[start:end], system.lam[start:end],
-        system.mobility[start:end], system.storage[start:end], past.length_s,
-        past.volume[start:end].reshape(e, 1), past.pressure[start:end].reshape(e, 1),
-        room.stress[start:end].reshape(e, 1, 3, 3), room.content[start:end].reshape(e, 1),
-        room.flux[start:end].reshape(e, 1, 3), room.volume[start:end].reshape(e, 1),
-    )  # fmt: skip
+def _cells(values, start, end):
+    """Returns values (n,) at some points as those of cells with a single point (e, 1)."""
+    return values[start:end].reshape(end - start, 1)
+
+
+@compiled
+def _cells_of_vectors(values, start, end):
+    return values[start:end].reshape(end - start, 1, 3)
+
+
+@compiled
+def _cells_of_matrices(values, start, end):
+    return values[start:end].reshape(end - start, 1, 3, 3)
 
 
 @compiled
@@ -167,7 +176,7 @@ def tangent(system, laws, past, room):
     )  # fmt: skip
     for law in range(len(laws.linearise)):
         if laws.linearise[law] != 0:
-            before, _, data, par = _of_law(laws, law, 0, n, past.memory, room.memory)
+            before, _, data, par = _of_law(laws, law, FIRST, n, past.memory, room.memory)
             call_linearise(
                 laws.linearise[law], past.time_s, past.elapsed_s, par, data, room.deformation,
                 room.at_pressure, room.at_slope, before, stress_f, stress_p, content_f, content_p, flux_f,
@@ -199,13 +208,29 @@ def _assembled(system, past, stress_f, stress_p, content_f, content_p, flux_f, f
         for c in range(m):
             stored[q, c] = w * content_p[q] * system.pressure[q, c]
     gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
+    solid_part, turned_part = _product_of_columns(gradient, solid), _product_of_columns(slope, turned)
+    column_part = _product_of_columns(column, system.pressure)
+    row_part = _product_of_columns(system.pressure, row)
+    stored_part, flow_part = _product_of_columns(system.pressure, stored), _product_of_columns(slope, flow)
     out = np.empty((k + m, k + m))
-    out[:k, :k] = system.solid + np.dot(gradient.T, solid)
-    out[:k, k:] = system.coupling + np.dot(column.T, system.pressure)
-    out[k:, :k] = system.coupling.T - (np.dot(system.pressure.T, row) + np.dot(slope.T, turned))
-    out[k:, k:] = past.length_s * system.flow
-    out[k:, k:] -= np.dot(system.pressure.T, stored) + np.dot(slope.T, flow)
+    for i in range(k):
+        for j in range(k):
+            out[i, j] = system.solid[i, j] + solid_part[i, j]
+        for j in range(m):
+            out[i, k + j] = system.coupling[i, j] + column_part[i, j]
+    for i in range(m):
+        for j in range(k):
+            out[k + i, j] = system.coupling[j, i] - (row_part[i, j] + turned_part[i, j])
+        for j in range(m):
+            flow_rate = past.length_s * system.flow[i, j]
+            out[k + i, k + j] = flow_rate - (stored_part[i, j] + flow_part[i, j])
     return out
+
+
+@compiled
+def _product_of_columns(left, right):
+    """Returns left' right."""
+    return np.dot(left.T, right)
 
 
 @compiled
@@ -213,94 +238,3 @@ def _add_multiple(to, factor, values):
     single = np.float32(factor)
     for c in range(len(values)):
         to[c] += single * values[c]
-
-
-@compiled
-def renew(system, laws, past, x, room, inverse, force_row, by_pads):
-    """Fills the inverse of the free part of the tangent at x, the force's row and the pads' column.
-
-    The rows of the pads' field and of the dual field are not solved for. The free rows come after them.
-    """
-    _kinematics(system, x, 0, system.weight.shape[0], room)
-    whole = tangent(system, laws, past, room)
-    free = whole[2:, 2:].copy()
-    scale = np.empty(free.shape[0])
-    for i in range(len(scale)):
-        scale[i] = 1.0 / np.sqrt(abs(free[i, i]) + 1e-300)
-    for i in range(len(scale)):
-        for j in range(len(scale)):
-            free[i, j] *= scale[i] * scale[j]
-    if not np.all(np.isfinite(free)):  # a law's values are not finite; the solve fails at its next step
-        inverse[:] = np.nan
-        return
-    inverse[:] = np.linalg.inv(free)
-    for i in range(len(scale)):
-        for j in range(len(scale)):
-            inverse[i, j] *= scale[i] * scale[j]
-    force_row[:] = 2.0 * whole[1, 2:]
-    by_pads[: len(scale)] = whole[2:, 0]
-    by_pads[len(scale)] = 2.0 * whole[1, 0]
-
-
-@compiled
-def solve(system, laws, past, x, tolerance, nominal_n, room, inverse, force_row, by_pads, counts):
-    """Solves a stage in place, from the guess x, whose first entry is the displacement of the pads.
-
-    inverse, force_row, by_pads : parts of the last tangent (`renew`), renewed where convergence is slow
-    counts (3,) : counters of iterations, residuals and tangents, to which this solve is added
-    Returns the status and the force [N], which the last step corrects to first order.
-    """
-    free = x[2:]
-    k = system.gradient.shape[2]
-    right, after = np.empty(len(x)), np.empty(len(x))
-    counts[1] += 1
-    if not residual(system, laws, past, x, room, right) > 0.0:
-        return INSIDE_OUT, 0.0
-    before, renewals = np.inf, 0
-    for iteration in range(MOST_ITERATIONS):
-        counts[0] += 1
-        step = -np.dot(inverse, right[2:])
-        force_step = np.dot(force_row, step)
-        size = max(0.1 * np.abs(step[: k - 2]).max(), abs(force_step) / nominal_n) / tolerance
-        if not np.isfinite(size):
-            return NOT_FINITE, 0.0
-        if (size < 1.0 and iteration > 0) or size < 0.01:
-            return CONVERGED, 2.0 * right[1] + force_step
-        if iteration > 0 and size > SLOW_CONTRACTION * before:
-            if renewals == MOST_RENEWALS:
-                return SLOW, 0.0
-            renewals += 1
-            counts[2] += 1
-            renew(system, laws, past, x, room, inverse, force_row, by_pads)
-            step = -np.dot(inverse, right[2:])
-            before = np.inf
-        else:
-            before = size
-        damping = 1.0
-        while True:
-            moved = x.copy()
-            moved[2:] = free + damping * step
-            counts[1] += 1
-            if residual(system, laws, past, moved, room, after) > 0.0:
-                break
-            damping *= 0.5
-            if damping < SMALLEST_DAMPING:
-                return INSIDE_OUT, 0.0
-        if damping == 1.0:
-            update(inverse, step, after[2:] - right[2:])
-        free[:] = moved[2:]
-        right[:] = after
-    return SLOW, 0.0
-
-
-@compiled
-def update(inverse, step, change):
-    """Corrects an inverse in place by Broyden's rank-one update (Broyden's good method)."""
-    answer = np.dot(inverse, change)
-    row = np.dot(step, inverse)
-    along = np.dot(row, change)
-    if abs(along) > 1e-3 * np.dot(step, step):
-        for i in range(len(step)):
-            share = (step[i] - answer[i]) / along
-            for j in range(len(step)):
-                inverse[i, j] += share * row[j]

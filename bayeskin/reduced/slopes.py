@@ -9,7 +9,8 @@ import numpy as np
 
 from bayeskin.finite_element.assembly import compiled
 from bayeskin.reduced.arrays import History, Laws, Room, System
-from bayeskin.reduced.kernels import SLOW_CONTRACTION, answer, renew, update
+from bayeskin.reduced.kernels import FIRST, add_linear, answer, product
+from bayeskin.reduced.newton import SLOW_CONTRACTION, fill_step, largest, renew, update
 from bayeskin.types import Array
 
 ENOUGH = 1e-3  # relative to the largest derivatives so far; the solve ends with a step below it
@@ -59,39 +60,45 @@ def differentiate(system, laws, past, x, room, varied, before, scale, inverse, f
     Returns the derivatives (r,) of the force [N], which the last step corrects to first order, and the number
     of tangents that were computed.
     """
-    k, r = system.gradient.shape[2], len(out.x)
+    k, r, size = system.gradient.shape[2], len(out.x), len(x)
     exact, force = _exact(system, past, x, varied, before), np.empty(r)
-    rows, worst, tangents = np.arange(r), np.inf, 0
+    step, change = np.empty((r, size - 2)), np.empty(size - 2)
+    rows, count, worst, tangents = np.arange(r), r, np.inf, 0
     left = _left(system, laws, past, room, varied, before, exact, rows, out)
     for _ in range(MOST_PASSES):
-        step, going = np.zeros((len(rows), len(x) - 2)), np.full(len(rows), False)
-        worst_before, worst = worst, 0.0
-        for a in range(len(rows)):
+        going, worst_before, worst = 0, worst, 0.0
+        for a in range(count):
             i = rows[a]
-            step[a] = -np.dot(inverse, left[a, 2:])
-            more = np.dot(force_row, step[a])
+            fill_step(inverse, left[a], step[going])
+            more, far = product(force_row, step[going]), largest(step[going], k - 2)
             force[i] = 2.0 * left[a, 1] + more
-            far = np.abs(step[a, : k - 2]).max()
-            scale[0, i] = max(scale[0, i], np.abs(out.x[i, :k]).max(), far)
+            scale[0, i] = max(scale[0, i], largest(out.x[i], k), far)
             scale[1, i] = max(scale[1, i], abs(force[i]))
             if far > 0.0:
                 now = max(far / scale[0, i], abs(more) / scale[1, i])
-                going[a] = not now < ENOUGH
                 worst = max(worst, now)
-        rows, left, step = rows[going], left[going], step[going]
-        if len(rows) == 0:
+                if not now < ENOUGH:
+                    rows[going] = i
+                    for c in range(size):
+                        left[going, c] = left[a, c]
+                    going += 1
+        count = going
+        if count == 0:
             break
         if worst > SLOW_CONTRACTION * worst_before:
             tangents += 1
             renew(system, laws, past, x, room, inverse, force_row, by_pads)
             worst = np.inf
-            for a in range(len(rows)):
-                step[a] = -np.dot(inverse, left[a, 2:])
-        for a in range(len(rows)):
-            out.x[rows[a], 2:] += step[a]
-        nearer = _left(system, laws, past, room, varied, before, exact, rows, out)
-        for a in range(len(rows)):
-            update(inverse, step[a], nearer[a, 2:] - left[a, 2:])
+            for a in range(count):
+                fill_step(inverse, left[a], step[a])
+        for a in range(count):
+            for c in range(size - 2):
+                out.x[rows[a], 2 + c] += step[a, c]
+        nearer = _left(system, laws, past, room, varied, before, exact, rows[:count], out)
+        for a in range(count):
+            for c in range(size - 2):
+                change[c] = nearer[a, 2 + c] - left[a, 2 + c]
+            update(inverse, step[a], change)
         left = nearer
     return force, tangents
 
@@ -105,10 +112,15 @@ def _left(system, laws, past, room, varied, before, exact, rows, out):
     n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
     r, step = len(rows), varied.step
     gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
-    solid, fluid = out.x[rows, :k].copy(), out.x[rows, k:].copy()
-    single, single_fluid = solid.astype(np.float32), fluid.astype(np.float32)
-    deformed = np.dot(single, gradient.T)
-    pressed, sloped = np.dot(single_fluid, system.pressure.T), np.dot(single_fluid, slope.T)
+    fields, pressures = np.empty((r, k), np.float32), np.empty((r, m), np.float32)
+    for parameter in range(r):
+        x = out.x[rows[parameter]]
+        for c in range(k):
+            fields[parameter, c] = x[c]
+        for c in range(m):
+            pressures[parameter, c] = x[k + c]
+    deformed = _product_of_rows(fields, gradient)
+    pressed, sloped = _product_of_rows(pressures, system.pressure), _product_of_rows(pressures, slope)
     other = Room(
         np.empty((n, 3, 3)), np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)),
         np.empty(n), np.empty((n, 3)), np.empty(n), np.empty(len(room.memory)),
@@ -133,19 +145,43 @@ def _left(system, laws, past, room, varied, before, exact, rows, out):
                 for b in range(3):
                     stress[parameter, 9 * q + 3 * a + b] = w * (other.stress[q, a, b] - room.stress[q, a, b])
             out.pressure[i, q] = pressed[parameter, q]
-        out.volume[i] = (other.volume - room.volume) / step
-        out.memory[i] = (other.memory - room.memory) / step
-    left = exact[rows]
-    left[:, :k] += np.dot(stress, gradient) + np.dot(solid, system.solid.T) + np.dot(fluid, system.coupling.T)
-    left[:, k:] += np.dot(solid, system.coupling) + past.length_s * np.dot(fluid, system.flow.T)
-    left[:, k:] -= np.dot(content, system.pressure) + np.dot(flux, slope)
+            out.volume[i, q] = (other.volume[q] - room.volume[q]) / step
+        for c in range(len(room.memory)):
+            out.memory[i, c] = (other.memory[c] - room.memory[c]) / step
+    return _projected(system, past, exact, rows, out.x, stress, content, flux)
+
+
+@compiled
+def _projected(system, past, exact, rows, x, stress, content, flux):
+    """Returns the rows of `_left` from the derivatives of the response at the points."""
+    n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
+    stressed = _product(stress, system.gradient.reshape(9 * n, k))
+    stored, flown = _product(content, system.pressure), _product(flux, system.slope.reshape(3 * n, m))
+    left = np.empty((len(rows), k + m))
+    for parameter in range(len(rows)):
+        i = rows[parameter]
+        for c in range(k):
+            left[parameter, c] = exact[i, c] + stressed[parameter, c]
+        for c in range(m):
+            left[parameter, k + c] = exact[i, k + c] - (stored[parameter, c] + flown[parameter, c])
+        add_linear(system, x[i], x[i], past.length_s, left[parameter])
     return left
+
+
+@compiled
+def _product(left, right):
+    return np.dot(left, right)
+
+
+@compiled
+def _product_of_rows(left, right):
+    """Returns left right'."""
+    return np.dot(left, right.T)
 
 
 @compiled
 def _answer_varied(system, laws, past, varied, before, i, other):
     """Fills `other` with the response of the laws after a step of parameter i and of the history."""
-    step = varied.step
     changed = System(
         system.gradient, system.pressure, system.slope, system.weight, varied.mu[i], varied.lam[i],
         varied.mobility[i], system.storage, system.solid, system.coupling, system.flow,
@@ -155,25 +191,40 @@ def _answer_varied(system, laws, past, varied, before, i, other):
         laws.data_at, laws.memory_width, laws.memory_at,
     )  # fmt: skip
     older = History(
-        past.volume + step * before.volume[i], past.pressure + step * before.pressure[i],
-        past.memory + step * before.memory[i], past.displacement, past.length_s, past.elapsed_s, past.time_s,
+        _moved(past.volume, varied.step, before.volume[i]),
+        _moved(past.pressure, varied.step, before.pressure[i]),
+        _moved(past.memory, varied.step, before.memory[i]),
+        past.displacement, past.length_s, past.elapsed_s, past.time_s,
     )  # fmt: skip
-    answer(changed, acting, older, 0, system.weight.shape[0], other)
+    answer(changed, acting, older, FIRST, system.weight.shape[0], other)
+
+
+@compiled
+def _moved(values, step, slopes):
+    """Returns values (n,) after a step along their slopes."""
+    out = np.empty(len(values))
+    for c in range(len(values)):
+        out[c] = values[c] + step * slopes[c]
+    return out
 
 
 @compiled
 def _exact(system, past, x, varied, before):
     """Returns the derivatives (r, k + m) of the exactly integrated parts at fixed x."""
-    k = system.gradient.shape[2]
-    force, fluid = x[:k].copy(), x[k:].copy()
-    out = np.zeros((varied.solid_by.shape[0], len(x)))
-    for s in range(varied.solid_units.shape[0]):
-        answer = np.dot(varied.solid_units[s], force)
-        for i in range(out.shape[0]):
-            out[i, :k] += varied.solid_by[i, s] * answer
-    for t in range(varied.flow_units.shape[0]):
-        answer = np.dot(varied.flow_units[t], fluid)
-        for i in range(out.shape[0]):
-            out[i, k:] += past.length_s * varied.flow_by[i, t] * answer
-    out[:, k:] -= np.dot(before.x[:, :k].copy(), system.coupling)
+    r, k, m = varied.solid_by.shape[0], system.gradient.shape[2], system.pressure.shape[1]
+    out = np.zeros((r, k + m))
+    for c in range(k):
+        for s in range(varied.solid_units.shape[0]):
+            by_unit = product(varied.solid_units[s, c], x[:k])
+            for i in range(r):
+                out[i, c] += varied.solid_by[i, s] * by_unit
+    for c in range(m):
+        for t in range(varied.flow_units.shape[0]):
+            by_unit = past.length_s * product(varied.flow_units[t, c], x[k:])
+            for i in range(r):
+                out[i, k + c] += varied.flow_by[i, t] * by_unit
+    for i in range(r):
+        for a in range(k):
+            for c in range(m):
+                out[i, k + c] -= before.x[i, a] * system.coupling[a, c]
     return out

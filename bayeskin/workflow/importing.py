@@ -56,7 +56,11 @@ def import_recording(
     """
     check_ending(out, ".h5")
     if markers is not None and sheet == ALL:
-        raise InputError(f"--markers {markers}", f"--sheet {ALL}", "a single table, with --sheet NAME")
+        raise InputError(
+            f"--markers {markers}",
+            f"markers belong to a single table, not to --sheet {ALL}",
+            "choose a table with --sheet NAME",
+        )
     stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
     readings = read_tables(file, sheet=sheet, stated=stated)
     outs = [out] if sheet != ALL else _outs(out, [reading.table for reading in readings])
@@ -100,7 +104,11 @@ def _units(texts: Sequence[str]) -> Mapping[str, Any]:
     for text in texts:
         quantity, equals, unit = text.partition("=")
         if not equals or quantity in units:
-            raise InputError(f"--unit {text}", repr(text), "QUANTITY=UNIT, once for a quantity")
+            raise InputError(
+                f"--unit {text}",
+                f"{quantity} has another unit already" if equals else "it states no unit",
+                "write --unit QUANTITY=UNIT, once for each quantity",
+            )
         units[quantity] = stated_unit(quantity, unit)
     return units
 

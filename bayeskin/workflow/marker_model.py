@@ -42,7 +42,7 @@ def likelihood_of_markers(
     moved_m = _runs(run, markers, motion, points)
     ok = np.isfinite(moved_m).all(axis=(1, 2, 3))
     if ok.sum() < FEWEST_A_PARAMETER * design.space.dim:
-        raise InputError("markers", f"{ok.sum()} runs that finish", "more points in the design")
+        raise InputError("markers", f"only {ok.sum()} runs finish", "the design needs more points")
     provenance = {"design_seed": design.seed, "model_hash": design.model_hash, "runs": int(ok.sum())}
     surrogate = train_marker_surrogate(design.space, theta[ok], moved_m[ok], weights[ok], provenance)
     run.reporter.log(f"markers: {ok.sum()} runs, error {1e6 * surrogate.rms_error_m:.2f} µm RMS")

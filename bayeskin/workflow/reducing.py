@@ -38,7 +38,7 @@ from bayeskin.workflow.folder import locked
 from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
-REFINEMENT = 1  # of the bricks of the full model that reduced models replace
+REFINEMENT = 1  # refinement of the full model that reduced models replace
 EXPECTED = "a configuration, or a file with [device] and [tissue]"
 
 
@@ -115,7 +115,7 @@ def _geometry(source: Path | None) -> Geometry:
     if source is None:
         return Geometry()
     if not source.is_file():
-        raise InputError(source, "no such file", EXPECTED)
+        raise InputError(source, "there is no such file", f"bayeskin needs {EXPECTED}")
     if "recording" not in read_toml(source, EXPECTED):
         return load_device(source).geometry
     config = load_config(source)
@@ -138,7 +138,9 @@ def _finished(path: Path, trained: Trained) -> bool:
         return False
     stored = load_reduced(path)
     if stored.trained.geometry != trained.geometry:
-        raise InputError(f"-o {path}", "a reduced model of another geometry", "another file name")
+        raise InputError(
+            f"-o {path}", "this file has a reduced model of another geometry", "use another name"
+        )
     return set(stored.trained.mechanisms) == set(trained.mechanisms)
 
 
@@ -162,8 +164,11 @@ def reduced_file(geometry: Geometry, beside: Sequence[Path]) -> Path:
     """Returns the file that `find_reduced` finds. Raises InputError where it finds none."""
     file = find_reduced(geometry, beside)
     if file is None:
-        expected = "a reduced model that `bayeskin reduce` makes from the device's file"
-        raise InputError("reduced model", "none for this device and tissue", expected)
+        raise InputError(
+            "reduced model",
+            "there is none for this device and tissue",
+            "make it from the device's file with `bayeskin reduce`",
+        )
     return file
 
 

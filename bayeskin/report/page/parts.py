@@ -158,8 +158,8 @@ class Verdict:
 class Answer:
     """Holds the answers to a reader's first questions: parameters, trust in them, and missing physics."""
 
-    made: Sequence[ParameterSummary]
-    made_of: Verdict
+    parameters: Sequence[ParameterSummary]
+    material: Verdict
     sure: Verdict
     missing: Verdict
 
