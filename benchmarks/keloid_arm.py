@@ -185,7 +185,8 @@ def quantities(located: OnSkin) -> dict[str, Array]:
 def comparison(located: OnSkin, outline: Array) -> list[list[str]]:
     """Returns table rows that compare residuals inside and outside of an outline.
 
-    The last cell is the shift of the outline across the pull [mm] at which inside and outside differ most.
+    The last cell is the shift of the outline across the pull [mm] at which inside and outside differ most, in
+    the same direction.
     """
     place_mm, table = 1e3 * located.place_m, []
     for name, values in quantities(located).items():
@@ -197,7 +198,8 @@ def comparison(located: OnSkin, outline: Array) -> list[list[str]]:
         cells += [f"{np.mean(values[inside]):.2f}", f"{np.mean(values[~inside]):.2f}", f"{by_shift[0.0]:.2f}"]
         for half in (place_mm[:, 0] < 0.0, place_mm[:, 0] >= 0.0):
             cells.append(f"{ranked_above(values[inside & half], values[~inside & half]):.2f}")
-        best = max(by_shift, key=lambda shift: abs(by_shift[shift] - 0.5))
+        sign = 1.0 if by_shift[0.0] >= 0.5 else -1.0
+        best = max(by_shift, key=lambda shift: sign * by_shift[shift])
         table.append([*cells, f"{best:+.0f} mm: {by_shift[best]:.2f}"])
     return table
 

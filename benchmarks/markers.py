@@ -104,7 +104,7 @@ class Case:
 CASES = {
     "usual": Case(), "demo": Case("demo"), "stiff": Case("stiff"), "finer mesh": Case(refinement=2),
     **{effect: Case(effect=effect) for effect in EFFECTS},
-    "guard that slips": Case(slip=0.02),
+    "guard that slips, 2 %": Case(slip=0.02), "guard that slips, 10 %": Case(slip=0.1),
 }  # fmt: skip
 
 
@@ -252,7 +252,7 @@ def margins() -> list[list[str]]:
 def guard() -> list[list[str]]:
     """Returns a table row of the fits without mechanisms to the usual skin, and to a guard that slips."""
     table = []
-    for name in ("usual", "guard that slips"):
+    for name in ("usual", "guard that slips, 2 %", "guard that slips, 10 %"):
         for markers in (False, True):
             row = fitted(name, "", markers)
             values, sds = json.loads(row["values"]), json.loads(row["sds"])

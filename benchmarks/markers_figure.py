@@ -76,7 +76,7 @@ def _draw_widths(ax: Axes, table: Sequence[Row], truth: Mapping[str, Mapping[str
     ax.tick_params(axis="y", labelsize=5.5, length=0)
     for label, colour in (("force", GREY), ("force and markers", MODEL)):
         ax.plot([], [], color=colour, lw=1.6, label=label)
-    ax.legend(loc="lower left")
+    ax.legend(loc="upper left")
     panel_title(ax, "a", "the skin")
 
 
@@ -87,7 +87,9 @@ def _draw_evidence(ax: Axes, table: Sequence[Row]) -> None:
         for shift, (markers, colour) in zip((-0.18, 0.18), COLOURS.items(), strict=True):
             gain = nats[effect, effect, markers] - nats[effect, "", markers]
             ax.barh(place + shift, max(gain, 0.0), 0.32, color=colour)
-            ax.text(max(gain, 0.0) + 3.0, place + shift, f"{gain:.0f}", va="center", color=INK, fontsize=6)
+            text = f"{max(gain, 0.0):.0f}"
+            ax.annotate(text, (max(gain, 0.0), place + shift), (3, 0), textcoords="offset points",
+                        va="center", color=INK, fontsize=6)  # fmt: skip
     ax.axvline(5.0, color=ACCENT, lw=0.8)
     ax.set(
         yticks=range(len(EFFECTS)), yticklabels=[name.replace("-", "-\n", 1) for name in EFFECTS],

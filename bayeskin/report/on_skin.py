@@ -88,7 +88,7 @@ def _draw_vectors(ax: Axes, located: _OnSkin) -> None:
         width=0.004,
     )  # fmt: skip
     scale_mm = float(f"{longest_mm:.1g}")
-    ax.quiverkey(arrows, 0.86, 1.04, enlarged * scale_mm, f"{scale_mm:g} mm", labelpos="E", color=INK)
+    ax.quiverkey(arrows, 0.92, 1.04, enlarged * scale_mm, f"{scale_mm:g} mm", labelpos="W", color=INK)
 
 
 def _draw_strain(figure: Figure, ax: Axes, located: _OnSkin, component: int) -> None:
