@@ -34,7 +34,12 @@ def test_everything_can_be_stated(bayeskin: Command, tmp_path: Path) -> None:
         "column 'cell' read as force in mN (stated by --unit)",
         "--zero subtracted the first displacement, 7 mm",
     ]
-    assert said["columns"]["displacement"] == {"number": 2, "header": "pull", "factor_to_si": -1e-3}
+    assert said["columns"]["displacement"] == {
+        "number": 2,
+        "header": "pull",
+        "unit": "mm",
+        "factor_to_si": -1e-3,
+    }
     assert said["zero_m"] == pytest.approx(7e-3)
     recording = storage.load(tmp_path / "r.h5", Recording)
     np.testing.assert_allclose(1e3 * recording.displacement_m, PULLED_MM, atol=1e-9)

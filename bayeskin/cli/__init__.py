@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import click
 
 import bayeskin
+from bayeskin.cli.app import app
 from bayeskin.cli.installation import doctor
 from bayeskin.cli.mismatch import diagnose, experiment
 from bayeskin.cli.models import reduce_, serve, simulate
@@ -30,7 +31,7 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 # All commands, in the order in which a user needs them.
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
-    "From a recording to an answer": (doctor, new, import_, run, diagnose, report, study),
+    "From a recording to an answer": (doctor, new, import_, run, diagnose, report, study, app),
     "Single stages": (reduce_, *STAGES),
     "Further commands": (experiment, simulate, export, serve, prove, conceal),
 }

@@ -16,16 +16,14 @@ from bayeskin.recordings.columns import Stated
 from bayeskin.recordings.headers import Column
 from bayeskin.recordings.settle import settled
 from bayeskin.recordings.tables import Table, Unreadable, tables_of
-from bayeskin.recordings.text import Rows, rows_of_text
-from bayeskin.recordings.workbooks import rows_of_array, sheets_of_xls, sheets_of_xlsx
+from bayeskin.recordings.text import rows_of_text
+from bayeskin.recordings.workbooks import WORKBOOKS, rows_of_array, sheets_of_workbook
 from bayeskin.types import Recording
 
 ALL = "all"  # this name of a sheet stands for every table of the file
-_WORKBOOKS = (".xlsx", ".xlsm", ".xls")
 _TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".tra", ".lvm", ".mach-1")
 _STORED = (".h5", ".hdf5")
-_ENDINGS = (*_WORKBOOKS, *_TEXTS, ".npy", *_STORED)
-_EARLY_EXCEL = (b"\x09\x00", b"\x09\x02", b"\x09\x04", b"\x09\x08")  # the first record of a workbook
+_ENDINGS = (*WORKBOOKS, *_TEXTS, ".npy", *_STORED)
 _NOTHING_STATED = Stated()
 
 
@@ -121,22 +119,13 @@ class _Labelled:
         return PLAUSIBLE.samples if isinstance(self.table, InputError) else self.table.rows
 
 
-def _sheets(path: Path, kind: str, data: bytes) -> Mapping[str, Rows] | None:
-    """Returns the rows of the sheets of a workbook, or None for a text. The content decides, not the name."""
-    if data.startswith(b"PK\x03\x04") or kind in (".xlsx", ".xlsm"):
-        return sheets_of_xlsx(path, data)
-    if data.startswith(b"\xd0\xcf\x11\xe0") or (kind == ".xls" and data[:2] in _EARLY_EXCEL):
-        return sheets_of_xls(path, data)
-    return None
-
-
 def _tables(
     path: Path, kind: str, data: bytes, sheet: str | None, stated: Stated
 ) -> tuple[list[_Labelled], tuple[str, ...]]:
     """Returns the tables of a file in their order, and notes. A sheet of the name `sheet` is read alone."""
     if kind == ".npy":
         return _labelled("", tables_of(str(path), rows_of_array(path, data), stated)), ()
-    sheets = _sheets(path, kind, data)
+    sheets = sheets_of_workbook(path, kind, data)
     if sheets is None:
         rows, delimiter, notes = rows_of_text(path, data)
         return _labelled("", tables_of(str(path), rows, stated, delimiter == " ")), notes

@@ -15,8 +15,19 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.recordings.text import NumberedRow, Rows
 
+WORKBOOKS = (".xlsx", ".xlsm", ".xls")  # the endings of workbooks
 MOST_UNPACKED = 2**30  # bytes of a workbook's parts; a sheet of a million rows with three columns has 10^8
 _MOST_ROWS, _MOST_COLUMNS = 2**20, 4096  # a sheet cannot have more rows, and a recording needs few columns
+_EARLY_EXCEL = (b"\x09\x00", b"\x09\x02", b"\x09\x04", b"\x09\x08")  # the first record of a workbook
+
+
+def sheets_of_workbook(path: Path, kind: str, data: bytes) -> Mapping[str, Rows] | None:
+    """Returns the rows of the sheets of a workbook, or None for a text. The content decides, not the name."""
+    if data.startswith(b"PK\x03\x04") or kind in (".xlsx", ".xlsm"):
+        return sheets_of_xlsx(path, data)
+    if data.startswith(b"\xd0\xcf\x11\xe0") or (kind == ".xls" and data[:2] in _EARLY_EXCEL):
+        return sheets_of_xls(path, data)
+    return None
 
 
 def sheets_of_xlsx(path: Path, data: bytes) -> Mapping[str, Rows]:

@@ -94,13 +94,19 @@ def trained_geometry(path: Path) -> Geometry | None:
         return _geometry(json.loads(handle.attrs["manifest"])["geometry"])
 
 
-@lru_cache(maxsize=4)
 def load_reduced(path: Path) -> ReducedModel:
-    """Returns the reduced model that `save_reduced` wrote.
+    """Returns the reduced model that `save_reduced` wrote; a file is read again only if it has been replaced.
 
     Raises InputError if the file is absent, truncated, altered or of another kind, or if the model was made
     from another version of the full model or of a mechanism's law.
     """
+    status = path.stat() if path.is_file() else None
+    return _loaded(path, () if status is None else (status.st_ino, status.st_mtime_ns, status.st_size))
+
+
+@lru_cache(maxsize=4)
+def _loaded(path: Path, state: tuple[int, ...]) -> ReducedModel:
+    """Returns the reduced model in a file; `state` differs when the file has been replaced."""
     with storage.reading(path, EXPECTED) as handle:
         if handle.attrs.get("format") != FORMAT:
             raise InputError(path, "it is an HDF5 file of another origin", f"bayeskin needs {EXPECTED}")

@@ -184,6 +184,7 @@ STAGE = Stage(
     ("seed", "model", "parameters", "noise"),
     _work,
     _files,
+    format=2,
 )
 
 

@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ def reduce(
     finished = _finished(path, trained)
     if finished:
         return _answer(path, load_reduced(path), 0.0, "done before, unchanged")
-    folder, started = path.with_name(f"{path.stem}-training"), time.perf_counter()
+    folder, started = training_folder(path), time.perf_counter()
     executor = nullcontext(local(WORKERS)) if scheduler is None else on_scheduler(scheduler)
     training_runs = Store(folder / "runs.store", "training runs", reporter.log)
     with executor as run_all, locked(folder), training_runs as store:
@@ -74,7 +74,7 @@ def reduce(
 def _build(
     path: Path, trained: Trained, settings: BuildSettings, store: Store, run_all: Map, reporter: Reporter
 ) -> None:
-    """Builds a first base model, then one from more runs, then the whole model.
+    """Builds a first base model, then one from more runs, then the mechanisms, first from fewer runs.
 
     Each replaces the one before it in the file, so that it can be used meanwhile.
     """
@@ -84,17 +84,26 @@ def _build(
         """Reports the progress."""
         reporter.progress(what, share)
 
+    def write(model: ReducedModel, sizes: BuildSettings, message: str) -> None:
+        """Writes a model that can be used, and says so."""
+        save_reduced(path, model, _manifest(sizes))
+        reporter.log(f"{path}: {message}")
+
+    first, names = settings.first, f"all {len(trained.mechanisms)} mechanisms"
     if not path.is_file():
-        first = settings.first
         reporter.log(f"a first base model is trained with {first.base_runs} full runs")
-        save_reduced(path, base_model(trained, full, first, run_all, progress), _manifest(first))
-        reporter.log(f"{path}: the first base model can be used")
-    reporter.log(f"the base model is trained with {settings.base_runs} full runs")
-    base = base_model(trained, full, settings, run_all, progress)
-    save_reduced(path, base, _manifest(settings))
-    reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
-    complete = with_mechanisms(base, trained, full, settings, run_all, progress)
-    save_reduced(path, complete, _manifest(settings))
+        write(base_model(trained, full, first, run_all, progress), first, "the first base model can be used")
+    model = load_reduced(path)
+    if not model.trained.mechanisms:
+        reporter.log(f"the base model is trained with {settings.base_runs} full runs")
+        model = base_model(trained, full, settings, run_all, progress)
+        write(model, settings, f"the base model can be used; {names} follow")
+        reporter.log(f"{names} are trained with {first.runs} full runs each")
+        model = with_mechanisms(model, trained, full, first, run_all, progress)
+        write(model, replace(settings, runs=first.runs), "the mechanisms can be used; better ones follow")
+    reporter.log(f"{names} are trained with {settings.runs} full runs each")
+    complete = with_mechanisms(model, trained, full, settings, run_all, progress)
+    write(complete, settings, "the model is finished")
 
 
 def _manifest(settings: BuildSettings) -> dict[str, Any]:
@@ -130,7 +139,7 @@ def default_path(source: Path | None) -> Path:
 
 
 def _finished(path: Path, trained: Trained) -> bool:
-    """Returns whether a file already contains the whole model.
+    """Returns whether a file already contains the finished model, so that no training is left to be done.
 
     Raises InputError for a file of another device.
     """
@@ -141,7 +150,12 @@ def _finished(path: Path, trained: Trained) -> bool:
         raise InputError(
             f"-o {path}", "this file has a reduced model of another geometry", "use another name"
         )
-    return set(stored.trained.mechanisms) == set(trained.mechanisms)
+    return set(stored.trained.mechanisms) == set(trained.mechanisms) and not training_folder(path).exists()
+
+
+def training_folder(path: Path) -> Path:
+    """Returns the folder that keeps the training runs of a reduced model until the model is finished."""
+    return path.with_name(f"{path.stem}-training")
 
 
 def find_reduced(geometry: Geometry, beside: Sequence[Path]) -> Path | None:

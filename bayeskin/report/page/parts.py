@@ -87,7 +87,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Key:
-    """Holds an entry of a chart's legend; `mark` is "dots", "line", "dashed" or "band"."""
+    """Holds an entry of a chart's legend; `mark` is "dots", "line", "dashed", "band" or a "phase"."""
 
     text: str
     mark: str
