@@ -200,8 +200,10 @@ def _calibration_inputs(run: Run, recording: Recording) -> _CalibrationInputs:
     """Returns bins, protocol and log-posterior of a run whose surrogate exists already."""
     fitted = prepared(run, recording, run.config.each_recording[0].protocol)
     files = shipped_files(run)
-    check_fits(run, files, load_design(files.design), fitted.binned, fitted.motion)
-    log_posterior = log_posterior_of(run, load_surrogate(files.surrogate), fitted.binned, fitted.motion)
+    design = load_design(files.design)
+    check_fits(run, files, design, fitted.binned, fitted.motion)
+    surrogate = load_surrogate(files.surrogate)
+    log_posterior = log_posterior_of(run, surrogate, fitted.binned, fitted.motion, design)
     return _CalibrationInputs(fitted.binned, fitted.motion, log_posterior)
 
 

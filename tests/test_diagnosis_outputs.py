@@ -83,6 +83,7 @@ class DrawnFit:
     held_out_n: np.ndarray | None
     located: Located
     values: Mapping[str, Mapping[str, Any]]
+    on_skin: None = None
 
 
 def drawn(left_n: float, held_out_by: float | None = None) -> DrawnFit:

@@ -93,7 +93,14 @@ def _imported(folder: RecordingFolder, choice: Choice) -> dict[str, Any]:
     units = [f"{quantity}={unit}" for quantity, unit in choice.units.items() if unit]
     columns = {quantity: column or None for quantity, column in choice.columns.items()}
     return import_recording(
-        Silent(), folder.original, folder.stored, choice.sheet or None, units, ZERO[choice.zero], **columns
+        Silent(),
+        folder.original,
+        folder.stored,
+        choice.sheet or None,
+        units,
+        ZERO[choice.zero],
+        None,
+        **columns,
     )
 
 

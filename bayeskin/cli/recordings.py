@@ -24,6 +24,7 @@ from bayeskin.errors import InputError
 @click.option(
     "--unit", "units", multiple=True, metavar="QUANTITY=UNIT", help="A unit, such as force=mN; repeatable."
 )
+@click.option("--markers", type=PATH, metavar="FILE", help="Tracks of points on the skin: time, point, x, y.")
 @click.option("--zero/--no-zero", default=None, help="Subtract the first displacement, or keep it.")
 @answered
 def import_(**options: Any) -> Mapping[str, Any]:
@@ -35,12 +36,16 @@ def import_(**options: Any) -> Mapping[str, Any]:
     it writes nothing and names the option that decides. A minus before a unit turns the sign, as
     --unit force=-N where a pull counts negative.
 
+    With --markers, tracks of points on the skin are read too, from a table with the columns time (s), point,
+    x and y (mm). They are checked and written beside the recording, as OUT-markers.h5.
+
     \b
     Example:
       bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
       bayeskin import series.xlsx --sheet "Test 3" -o runs/test-3.h5
       bayeskin import series.xlsx --sheet all -o runs/series.h5
       bayeskin import arm.csv --displacement Position --unit force=gf --zero -o runs/arm.h5
+      bayeskin import arm.csv --markers tracks.csv -o runs/arm.h5
     """
     from bayeskin.workflow.importing import import_recording
 

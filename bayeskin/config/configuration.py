@@ -78,6 +78,8 @@ class Config(Section):
             raise InputError(
                 "recordings", f"{twice!r} is the name of two files", "each file needs a name of its own"
             )
+        if any(recording.markers is not None for recording in self.each_recording):
+            self._refuse_markers_without_their_model()
         if self.recordings and self.fit.windows_s is not None:
             raise InputError(
                 "fit.windows_s",
@@ -97,6 +99,21 @@ class Config(Section):
                 "leave out this key",
             )
         return self
+
+    def _refuse_markers_without_their_model(self) -> None:
+        """Raises InputError for markers beside several recordings, or with a model without displacements."""
+        model = self.model.spec()
+        if self.recordings:
+            raise InputError(
+                "recordings.markers", "several recordings cannot have markers", "leave out this key"
+            )
+        if not (model.formulation.reducible and model.mesh == "bricks"):
+            problem = f"observation {model.observation!r} on mesh {model.mesh!r} gives no displacements"
+            raise InputError("recording.markers", problem, "use observation 'reaction' on mesh 'bricks'")
+        if self.surrogate.file is not None:
+            raise InputError(
+                "surrogate.file", "a shipped surrogate does not know the markers", "leave out this key"
+            )
 
     @property
     def each_recording(self) -> tuple[RecordingConfig, ...]:
@@ -147,6 +164,8 @@ class Config(Section):
                 del plain[name]
         if not self.recordings:
             del plain["recordings"]
+            if plain["recording"]["markers"] is None:
+                del plain["recording"]["markers"]
         if not self.fit.shared:
             del plain["fit"]["shared"]
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()

@@ -27,11 +27,13 @@ class RecordingConfig(Section):
     """The recording, and how the protocol of the model follows its displacement.
 
     With "idealised", the protocol goes straight between the recording's corners, whose times and
-    displacements are rounded. With "recorded", it follows the measured displacement closely.
+    displacements are rounded. With "recorded", it follows the measured displacement closely. `markers` is a
+    file with tracks of points on the skin, as `bayeskin import --markers` writes it.
     """
 
     file: str
     protocol: Literal["recorded", "idealised"] = "idealised"
+    markers: str | None = None
 
 
 class ModelConfig(Section):
@@ -189,11 +191,15 @@ class FitConfig(Section):
 
 
 class NoiseConfig(Section):
-    """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index."""
+    """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index.
+
+    `marker_sd_m` bounds the sd [m] of the noise of markers.
+    """
 
     sd_n: tuple[float, float] | None = None
     tau_s: tuple[float, float] | None = None
     nu: tuple[float, float] | None = None
+    marker_sd_m: tuple[float, float] | None = None
 
     @model_validator(mode="after")
     def _lower_bounds_lie_below_upper(self) -> NoiseConfig:

@@ -19,11 +19,15 @@ class ModelRun:
 
     theta (d,) : parameters in SI units; force_n (m,) : means of the force over bins [N]
     slopes_n (m, d) : derivatives of force_n by coordinates of the prior's box [N], or None
+    markers_m (t - 1, p, 2), marker_slopes_m (t - 1, p, 2, d) : displacements of markers since the first image
+        [m], and their derivatives; None without markers
     """
 
     theta: Array
     force_n: Array
     slopes_n: Array | None
+    markers_m: Array | None = None
+    marker_slopes_m: Array | None = None
 
 
 class ForwardModel(Protocol):

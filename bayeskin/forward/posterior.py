@@ -7,10 +7,12 @@ import numpy as np
 from bayeskin.finite_element.accuracy import mesh_error
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.inference import LogPosterior, NoisePriors
+from bayeskin.inference.marker_error import mesh_correction, smooth_errors
+from bayeskin.inference.marker_likelihood import MarkerLikelihood, PredictsMarkers
 from bayeskin.inference.model_error import ErrorSizes, ModelError
 from bayeskin.inference.noise_model import Windows
 from bayeskin.inference.problem import Excludes
-from bayeskin.types import Array, BinnedForce, PadMotion, ParameterSpace, Surrogate
+from bayeskin.types import Array, BinnedForce, Markers, PadMotion, ParameterSpace, Surrogate
 
 UNKNOWN_MESH = 5e-3  # RMS error of bricks that no study was made of, over the force (docs/discretisation.md)
 
@@ -30,6 +32,18 @@ def posterior_of(
     return LogPosterior(
         force, binned, None if windows is None else tuple(windows), noise, priors, None, excludes, error
     )
+
+
+def marker_likelihood(
+    markers: Markers, model: PredictsMarkers, spec: ModelSpec, motion: PadMotion
+) -> MarkerLikelihood:
+    """Returns the likelihood of markers, with the errors of the full model's displacements.
+
+    spec : the full model whose displacements `model` predicts
+    """
+    correction_m, amplitude_m = mesh_correction(markers, spec.refinement)
+    errors_m = np.concatenate([amplitude_m[None], smooth_errors(markers, motion, spec.geometry.gauge_m)])
+    return MarkerLikelihood(markers, model, correction_m, errors_m)
 
 
 def model_error(spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ModelError | None:

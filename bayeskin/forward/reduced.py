@@ -15,16 +15,21 @@ from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import REGION
 from bayeskin.reduced.simulate import simulate_reduced
-from bayeskin.types import Array, PadMotion, ParameterSpace, Simulation
+from bayeskin.reduced.surface import SurfaceRun, simulate_surface
+from bayeskin.types import Array, Markers, PadMotion, ParameterSpace, Simulation
 
 
 @dataclass(frozen=True)
 class ReducedForward:
-    """The reduced model of a device on a protocol; edges_s (m+1,) : edges of the bins [s]."""
+    """The reduced model of a device on a protocol.
+
+    edges_s (m+1,) : edges of the bins [s]; markers : tracks of points whose displacements are computed too
+    """
 
     model: ReducedModel
     motion: PadMotion
     edges_s: Array
+    markers: Markers | None = None
 
     @property
     def solves(self) -> frozenset[str]:
@@ -53,17 +58,34 @@ class ReducedForward:
         values = dict(zip(space.names, map(float, at), strict=True))
         if derive:
             values |= beside_neutral(values, by, mechanisms)
-        simulation = self.simulated(self.motion, values, mechanisms, by if derive else None)
+        run = self._with_markers(values, mechanisms, by if derive else None)
+        simulation, markers_m, marker_slopes_m = run.simulation, run.displacement_m, run.slopes_m
         if simulation.status != "ok":
             return simulation.message
         force_n = simulation.bin_means(self.edges_s)
         if not derive:
-            return ModelRun(at, force_n, None)
+            return ModelRun(at, force_n, None, markers_m)
         if not np.all(np.isfinite(simulation.gradient_n)):
             return "the derivatives of the run are not finite"
         slopes_n = simulation.gradient_bin_means(self.edges_s)
         offset = np.array([(values[name] - wanted) / by[name] for name, wanted in zip(by, at, strict=True)])
-        return ModelRun(at, force_n - slopes_n @ offset, slopes_n)
+        if markers_m is not None and marker_slopes_m is not None:
+            markers_m = markers_m - marker_slopes_m @ offset
+        return ModelRun(at, force_n - slopes_n @ offset, slopes_n, markers_m, marker_slopes_m)
+
+    def _with_markers(
+        self, values: Mapping[str, float], mechanisms: Sequence[Mechanism], by: Mapping[str, float] | None
+    ) -> SurfaceRun:
+        """Returns a run on the recording's protocol, with the displacements of markers where there are any.
+
+        by : changes of parameters to differentiate by
+        """
+        if self.markers is None:
+            return SurfaceRun(self.simulated(self.motion, values, mechanisms, by))
+        return simulate_surface(
+            self.model, self.motion, values, mechanisms, by, self.markers.reference_m, self.markers.time_s,
+            REGION.least_stiffness_if_checked,
+        )  # fmt: skip
 
     def simulated(
         self, motion: PadMotion, values: Mapping[str, float], mechanisms: Sequence[Mechanism],

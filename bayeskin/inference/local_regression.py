@@ -46,6 +46,11 @@ class LocalRegression:
         slope = (mean[1:] - mean[0])[:, bins] / (side * share)[:, None]
         self.slope = slope.T  # (k, inner), change of the force [N] over the width of the box
         self.noise = x[self.inner :]
+        self._markers: tuple[Array, Array] | None = None
+        if log_posterior.markers is not None:
+            moved_m = log_posterior.predict_markers(theta)
+            by_m = (moved_m[1:] - moved_m[0]) / (side * share)[:, None, None, None]
+            self._markers = moved_m[0], by_m
         self._columns: tuple[Array, Array, Array] | None = None
 
     def with_noise(self, quick: bool) -> Array:
@@ -85,8 +90,10 @@ class LocalRegression:
                 np.zeros((count * len(tried), mean.shape[1], 1)),
                 np.repeat(self.here.diagonal, count * len(tried), axis=0),
             )
-            each = log_likelihood(self.chain, predictions, np.repeat(self._noise(tried), count, axis=0))
-            return np.asarray(each.reshape(-1, count).mean(axis=1))
+            rows = self._at_noise(tried)
+            noise = np.repeat(self.log_posterior.split(rows)[1], count, axis=0)
+            each = log_likelihood(self.chain, predictions, noise)
+            return np.asarray(each.reshape(-1, count).mean(axis=1)) + self._of_markers(rows)
 
         value, gradient, second = _finite_differences(values, unit, self.settings.step)
         far = np.maximum(np.abs(second), np.abs(gradient) / self.settings.farthest_noise)
@@ -105,14 +112,23 @@ class LocalRegression:
 
     def _values(self, unit: Array) -> Array:
         """Returns log-likelihoods (n,) at noise parameters (n, q) in the unit cube."""
-        return log_likelihood(self.chain, self.here, self._noise(unit))
+        rows = self._at_noise(unit)
+        of_force = log_likelihood(self.chain, self.here, self.log_posterior.split(rows)[1])
+        return of_force + self._of_markers(rows)
 
-    def _noise(self, unit: Array) -> Array:
-        """Returns noise parameters (n, q) in SI from points of the unit cube."""
+    def _of_markers(self, rows: Array) -> Array | float:
+        """Returns the log-likelihood of the markers (n,) at SI values (n, D) that differ in their noise."""
+        markers = self.log_posterior.markers
+        if markers is None or self._markers is None:
+            return 0.0
+        return markers.log_density(self._markers[0][None], rows[:, -1])
+
+    def _at_noise(self, unit: Array) -> Array:
+        """Returns the point in SI with other noise (n, D), from noise parameters (n, q) in the unit cube."""
         low, high = self.low[self.inner :], self.high[self.inner :]
         rows = np.repeat(self.x[None], len(unit), axis=0)
         rows[:, self.inner :] = low + np.clip(unit, 0.0, 1.0) * (high - low)
-        return self.log_posterior.split(self.log_posterior.from_sampling(rows))[1]
+        return self.log_posterior.from_sampling(rows)
 
     def white(self, columns: Array) -> Array:
         """Returns the columns (k, n), whitened to innovations of the present noise."""
@@ -132,15 +148,26 @@ class LocalRegression:
             self._columns = white[:, 0], white[:, 1 : self.inner + 1], white[:, self.inner + 1 :]
         return self._columns
 
-    def prior(self, x: Array) -> tuple[Array, Array]:
-        """Returns the gradient (d,) of the material's log prior at x (D,), and its negative curvature (d, d).
+    def beside_force(self, x: Array) -> tuple[Array, Array]:
+        """Returns the gradient (d,) of what is beside the force, and its negative curvature (d, d).
 
-        Both are derivatives over the unit cube.
+        This is the log prior of the material at x (D,), and the markers' log-likelihood near the point. Both
+        results are derivatives over the unit cube.
         """
         width = (self.high - self.low)[: self.inner]
         gradient, curvature = self.log_posterior.space.log_density_slopes(x)
         inner = curvature[: self.inner, : self.inner]
-        return width * gradient[: self.inner], np.outer(width, width) * inner
+        pull, bend = width * gradient[: self.inner], np.outer(width, width) * inner
+        markers = self.log_posterior.markers
+        if markers is None or self._markers is None:
+            return pull, bend
+        sd_m = self.log_posterior.from_sampling(np.concatenate([x[: self.inner], self.noise]))[-1]
+        (here_m, by_m), images = self._markers, len(self._markers[0])
+        columns_m = np.concatenate([markers.residual_m(here_m[None]), by_m.reshape(self.inner, images, -1)])
+        white = markers.whitened(columns_m.transpose(1, 2, 0), float(sd_m)).reshape(-1, 1 + self.inner)
+        slopes = white[:, 1:]
+        step = (x[: self.inner] - self.x[: self.inner]) / width
+        return pull + slopes.T @ (white[:, 0] - slopes @ step), bend + slopes.T @ slopes
 
     def steps(
         self, x: Array, dampings: Sequence[float], quick: bool = False, explained: Array | float = 0.0,
@@ -159,7 +186,7 @@ class LocalRegression:
         width = (self.high - self.low)[: self.inner]
         room_up = (self.high[: self.inner] - x[: self.inner]) / width
         room_down = (self.low[: self.inner] - x[: self.inner]) / width
-        pull, bend = self.prior(x)
+        pull, bend = self.beside_force(x)
         if free is not None:
             pull, bend = pull * free, bend * np.outer(free, free)
 
@@ -201,7 +228,7 @@ class LocalRegression:
         unit = (self.noise - low) / (high - low)
         _, noise_gradient, second = _finite_differences(self._values, unit, self.settings.step)
         information = np.diag(np.concatenate([np.zeros(self.inner), np.maximum(-second, 0.0)]))
-        pull, bend = self.prior(self.x)
+        pull, bend = self.beside_force(self.x)
         information[: self.inner, : self.inner] = material + bend
         return information, np.concatenate([material_gradient + pull, noise_gradient]), latent
 

@@ -39,6 +39,7 @@ from bayeskin.types import (
 )
 from bayeskin.types.joint import own_name, plain_name, recording_at, recording_of
 
+MARKER_SD = "marker_sd"
 ALL = "noise"  # the kind of all phases where they share one sd
 Windows = Sequence[tuple[float, float]]
 _SOURCE = "weakly informative: spans what load cells and living skin show"
@@ -48,6 +49,7 @@ _SOURCE = "weakly informative: spans what load cells and living skin show"
 class NoisePriors:
     """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index.
 
+    marker_sd_m : bounds of the sd of the markers' noise [m]; a known sd has bounds that are all but equal
     by_kind : whether each kind of phase has an sd of its own
     by_recording : whether each of several recordings has an sd of its own; all share memory and tails, which
         are the load cell's
@@ -56,6 +58,7 @@ class NoisePriors:
     sd_n: tuple[float, float] = (1e-4, 0.3)
     tau_s: tuple[float, float] = (0.1, 10.0)
     nu: tuple[float, float] = (2.0, 100.0)
+    marker_sd_m: tuple[float, float] = (1e-6, 1e-3)
     by_kind: bool = True
     by_recording: bool = True
 
@@ -93,6 +96,14 @@ def noise_space(kinds: Sequence[str], priors: NoisePriors | None = None) -> Para
     tau = Parameter("tau_noise", "s", *priors.tau_s, "log-uniform", "correlation time of the noise", _SOURCE)
     nu = Parameter("nu_noise", "1", *priors.nu, "log-uniform", "tail index of the noise", _SOURCE)
     return ParameterSpace((*sds, tau, nu))
+
+
+def marker_noise(priors: NoisePriors) -> Parameter:
+    """Returns the sd of the markers' noise [m], with a log-uniform prior."""
+    source = "weakly informative: spans what image correlation of skin reaches"
+    return Parameter(
+        MARKER_SD, "m", *priors.marker_sd_m, "log-uniform", "noise sd of the markers", source
+    )  # fmt: skip
 
 
 def bins_in_windows(binned: BinnedForce, windows: Windows | None) -> NDArray[np.int64]:

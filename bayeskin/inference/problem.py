@@ -19,9 +19,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.inference.likelihood import log_likelihood
+from bayeskin.inference.marker_likelihood import MarkerLikelihood
 from bayeskin.inference.model_error import ModelError
-from bayeskin.inference.noise_model import NoiseChain, NoisePriors, noise_chain, noise_space
-from bayeskin.types import POINTS_AT_ONCE, Array, BinnedForce, ParameterSpace, Prediction, Surrogate
+from bayeskin.inference.noise_model import (
+    NoiseChain,
+    NoisePriors,
+    marker_noise,
+    noise_chain,
+    noise_space,
+)
+from bayeskin.types import (
+    POINTS_AT_ONCE,
+    Array,
+    BinnedForce,
+    Parameter,
+    ParameterSpace,
+    Prediction,
+    Surrogate,
+)
 
 # Half-width of the prior of a parameter that is held, in its logarithm or as a share of its prior's range.
 HELD = 1e-9
@@ -41,7 +56,8 @@ class LogPosterior:
     all bins. `material` replaces the surrogate's own prior; its box must lie in the surrogate's box.
     `excludes` takes rows (n, d) of the surrogate's parameters and returns True where the prior is zero. The
     density is also zero where the surrogate's sd, RMS over all bins, exceeds `sure_within_n` [N]. Otherwise a
-    surrogate that knows next to nothing there could explain any recording.
+    surrogate that knows next to nothing there could explain any recording. `markers` are tracks of points on
+    the skin, whose likelihood multiplies that of the force. The sd of their noise is the last parameter then.
     Raises InputError when surrogate, bins, windows or priors do not belong together.
     """
 
@@ -53,6 +69,7 @@ class LogPosterior:
     sure_within_n: float | None = None
     excludes: Excludes | None = None
     model_error: ModelError | None = None
+    markers: MarkerLikelihood | None = None
 
     def __post_init__(self) -> None:
         ours, theirs = self.binned.edges_s, self.surrogate.edges_s
@@ -80,16 +97,30 @@ class LogPosterior:
 
     @cached_property
     def space(self) -> ParameterSpace:
-        """Returns the priors of all sampled parameters: first the material's, then the noise's."""
+        """Returns the priors of all sampled parameters: first the material's, then the noise's.
+
+        The noise of markers comes last.
+        """
         material = self.material or self.surrogate.space
         return ParameterSpace(
-            material.parameters + noise_space(self.chain.kinds, self.noise_priors).parameters,
+            material.parameters + self._noise_parameters,
             material.correlations,
         )
+
+    @cached_property
+    def _noise_parameters(self) -> tuple[Parameter, ...]:
+        of_force = noise_space(self.chain.kinds, self.noise_priors).parameters
+        return of_force if self.markers is None else (*of_force, marker_noise(self.noise_priors))
 
     @property
     def names(self) -> tuple[str, ...]:
         return self.space.names
+
+    @property
+    def force_noise(self) -> slice:
+        """Returns the columns of the parameters of the force's noise."""
+        start = self.surrogate.space.dim
+        return slice(start, start + len(self._noise_parameters) - (self.markers is not None))
 
     @property
     def dim(self) -> int:
@@ -109,10 +140,9 @@ class LogPosterior:
         return np.clip(self.space.from_line(vectors), self.space.lower, self.space.upper)
 
     def split(self, theta: ArrayLike) -> tuple[Array, Array]:
-        """Returns the material (n, d) and noise (n, q) columns of SI values (n, D)."""
+        """Returns the columns of the material (n, d) and of the force's noise (n, q) of SI values (n, D)."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        d = self.surrogate.space.dim
-        return theta[:, :d], theta[:, d:]
+        return theta[:, : self.surrogate.space.dim], theta[:, self.force_noise]
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Returns the prediction on all bins, with the model's error, at SI values (n, D), (n, d) or (d,)."""
@@ -167,8 +197,19 @@ class LogPosterior:
         return self._log_likelihood(theta, self.predict(theta))
 
     def _log_likelihood(self, theta: Array, prediction: Prediction) -> Array:
-        value = log_likelihood(self.chain, prediction, self.split(theta)[1])
+        value = log_likelihood(self.chain, prediction, self.split(theta)[1]) + self.of_markers(theta)
         return np.where(self.impossible(theta, prediction), -np.inf, value)
+
+    def of_markers(self, theta: Array) -> Array | float:
+        """Returns the log-likelihood of the markers (n,) at SI values (n, D); zero without markers."""
+        if self.markers is None:
+            return 0.0
+        return self.markers.log_density(self.predict_markers(theta), theta[:, -1])
+
+    def predict_markers(self, theta: Array) -> Array:
+        """Returns the markers' displacements (n, t - 1, p, 2) [m] at SI values (n, D) or (n, d)."""
+        assert self.markers is not None
+        return self.markers.predict_m(theta, self.surrogate.space.names)
 
     def impossible(self, theta: Array, prediction: Prediction) -> NDArray[np.bool_]:
         """Returns which rows (n, D) in SI `excludes` or `sure_within_n` rules out, given the prediction."""
@@ -239,6 +280,7 @@ class LogPosterior:
             "recording": _sha256(repr(b.phases), *(np.ascontiguousarray(a).tobytes() for a in arrays)),
             "fit windows": _sha256(repr(self.fit_windows)),
             "model error": _sha256(*self._model_error_texts()),
+            **({} if self.markers is None else {"markers": self.markers.identity}),
         }
 
     def _restriction_texts(self) -> tuple[str, ...]:

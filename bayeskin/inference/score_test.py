@@ -71,7 +71,7 @@ class _ScoreTests:
         residual, slopes, factor = linear.columns()
         design = np.concatenate([slopes[:, self._others], factor], axis=1)
         moved = int(self._others.sum())
-        pull, bend = linear.prior(vector)
+        pull, bend = linear.beside_force(vector)
         precision = np.r_[np.full(moved, UNIFORM_PRECISION), np.ones(factor.shape[1])]
         normal = design.T @ design + np.diag(precision)
         normal[:moved, :moved] += bend[np.ix_(self._others, self._others)]

@@ -125,7 +125,7 @@ def _fit_from_json(
     context: DiagnosisContext, plain: Mapping[str, Any], until_s: float | None = None
 ) -> SetFit:
     """Returns the fit that `as_json` converted to JSON's types."""
-    run = ModelRun(*(np.array(plain["run"][name]) for name in ("theta", "force_n", "slopes_n")))
+    run = ModelRun(**{name: np.array(values) for name, values in plain["run"].items()})
     correction_n = np.array(plain["off_n"])
     posterior = context.posterior(
         plain["fit"]["names"], [run], correction_n if correction_n.any() else None, until_s

@@ -17,9 +17,10 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import Form, propose_form
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.misfit import misfit_n
+from bayeskin.mismatch.on_skin import OnSkin, on_skin
 from bayeskin.mismatch.resample import PosteriorDraws
 from bayeskin.mismatch.set_posterior import draws_near_run
-from bayeskin.types import Array, BinnedForce
+from bayeskin.types import Array, BinnedForce, PadMotion
 
 PREDICTIVE_DRAWS = 300  # number of posterior draws from which predictive bands are computed
 
@@ -31,6 +32,7 @@ class AssessedFit:
     drawn : draws of the posterior; band_n : edges (m,) [N] of the predictive 90 % band
     located : windows in which the fit differs from the recording
     beginning : fit to the recording's beginning, or None without one
+    on_skin : where on the skin markers move otherwise than the fit says; None without markers
     """
 
     fit: Fit
@@ -38,6 +40,7 @@ class AssessedFit:
     band_n: tuple[Array, Array]
     located: Located
     beginning: Fit | None
+    on_skin: OnSkin | None = None
 
     @property
     def binned(self) -> BinnedForce:
@@ -112,11 +115,13 @@ def assess(context: DiagnosisContext, explanation: Explanation) -> Diagnosis:
     base, best = explanation.search.fits[()].fit, explanation.emulated.fit
     beginning, seed = explanation.beginning, context.seed
     base_beginning, best_beginning = (None, None) if beginning is None else (beginning.base, beginning.best)
-    after = _assessed(best, best, explanation.emulated.draws, best_beginning, seed)
+    motion = context.motion
+    after = _assessed(best, best, explanation.emulated.draws, best_beginning, seed, motion)
     if explanation.best:
-        before = _assessed(base, best, draws_near_run(base, seed), base_beginning, seed)
+        before = _assessed(base, best, draws_near_run(base, seed), base_beginning, seed, motion)
     else:  # both are fits of the base model, whose posterior has been sampled already
-        before = replace(after, fit=base, located=_located(base, best, seed))
+        located = _located(base, best, seed)
+        before = replace(after, fit=base, located=located, on_skin=on_skin(base, motion))
     return Diagnosis(
         explanation, before, after,
         contributions(explanation.best, best.theta, context.reported, context.known),
@@ -125,11 +130,13 @@ def assess(context: DiagnosisContext, explanation: Explanation) -> Diagnosis:
     )  # fmt: skip
 
 
-def _assessed(fit: Fit, best: Fit, drawn: PosteriorDraws, beginning: Fit | None, seed: int) -> AssessedFit:
+def _assessed(
+    fit: Fit, best: Fit, drawn: PosteriorDraws, beginning: Fit | None, seed: int, motion: PadMotion
+) -> AssessedFit:
     """Returns an assessed fit; its noise is that of the best fit, which takes no mismatch for noise."""
     draws = inference.evenly(drawn.draws, PREDICTIVE_DRAWS)
     band_n = inference.bands(fit.log_posterior, draws, np.random.default_rng(1)).interval(0.9)
-    return AssessedFit(fit, drawn, band_n, _located(fit, best, seed), beginning)
+    return AssessedFit(fit, drawn, band_n, _located(fit, best, seed), beginning, on_skin(fit, motion))
 
 
 def _located(fit: Fit, best: Fit, seed: int) -> Located:

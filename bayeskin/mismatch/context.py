@@ -11,19 +11,21 @@ import numpy as np
 from bayeskin.forward.interface import ForwardModel, ModelRun
 from bayeskin.forward.joint import JointForward
 from bayeskin.forward.observed import FullForce
-from bayeskin.forward.posterior import posterior_of
+from bayeskin.forward.posterior import marker_likelihood, posterior_of
 from bayeskin.forward.reduced import ReducedForward
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.noise_model import ALL, noise_space
+from bayeskin.inference.noise_model import ALL, MARKER_SD, noise_space
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
 from bayeskin.mechanisms.each_recording import in_each_recording, in_one_recording
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.noise_bounds import instrument_noise
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.stiffness_ratio import subcutis_too_stiff
-from bayeskin.mismatch.tangent import Tangent
-from bayeskin.types import Array, BinnedForce, Jumps, PadMotion, ParameterSpace, Surrogate
+from bayeskin.mismatch.tangent import MarkerTangent, Tangent
+from bayeskin.types import Array, BinnedForce, Jumps, Markers, PadMotion, ParameterSpace, Surrogate
 from bayeskin.types.joint import own_name, plain_name, values_in
+
+START_SD_M = 1e-4  # noise of the markers from which fits start
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class DiagnosisContext:
         samples allow; motion : its protocol
     base : priors of the base model; stated_noise : bounds of noise parameters that replace the usual ones
     shared : what several recordings share besides the skin: "noise", or names of mechanisms of the instrument
+    markers : tracks of points on the skin, which the forward model then computes too
     """
 
     binned: BinnedForce
@@ -44,6 +47,7 @@ class DiagnosisContext:
     seed: int
     stated_noise: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     shared: tuple[str, ...] = ()
+    markers: Markers | None = None
 
     @cached_property
     def known(self) -> dict[str, Mechanism]:
@@ -92,7 +96,8 @@ class DiagnosisContext:
         """Returns the noise parameters from which fits start: the middle of their priors."""
         recordings = range(len(self.binned.parts) if self.noise_priors.by_recording else 1)
         space = noise_space([own_name(ALL, number) for number in recordings], self.noise_priors)
-        return dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
+        middle = dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
+        return middle if self.markers is None else {**middle, MARKER_SD: START_SD_M}
 
     def solved(self, names: Sequence[str]) -> list[Mechanism]:
         """Returns the mechanisms of a set that the forward model solves, ordered by name."""
@@ -188,6 +193,11 @@ class DiagnosisContext:
             force, self.forward.spec, self.binned, self.motion, self.noise_priors, priors, windows,
             subcutis_too_stiff,
         )  # fmt: skip
+        if self.markers is not None:
+            model = MarkerTangent(self.space(names), tuple(runs))
+            seen = self.markers if until_s is None else self.markers.until(until_s)
+            markers = marker_likelihood(seen, model, self.forward.spec, self.motion)
+            posterior = replace(posterior, markers=markers)
         if correction_n is None or posterior.model_error is None:
             return posterior
         return replace(posterior, model_error=replace(posterior.model_error, measured_n=correction_n[None]))

@@ -159,7 +159,7 @@ def _allowed(
     reach them.
     """
     log_posterior, chain = fit.log_posterior, fit.log_posterior.chain
-    noise_values = [noise[name] for name in log_posterior.names[log_posterior.surrogate.space.dim :]]
+    noise_values = [noise[name] for name in log_posterior.names[log_posterior.force_noise]]
     point = log_posterior.from_sampling(log_posterior.vector(fit.theta))[None]
     best = log_posterior.predict(point)
     diagonal = np.repeat(best.diagonal[:, chain.bins], draws, axis=0)

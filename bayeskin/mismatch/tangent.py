@@ -94,3 +94,41 @@ class Tangent(FreezesArrays):
     def _log_widths(self, columns: NDArray[np.intp]) -> Array:
         """Returns the widths of the parameters' priors in logarithms."""
         return np.asarray(np.log(self.space.upper[columns] / self.space.lower[columns]))
+
+
+@dataclass(frozen=True)
+class MarkerTangent(FreezesArrays):
+    """The displacements of markers near runs of a forward model; it satisfies `inference.PredictsMarkers`.
+
+    Near one run they are linear in the coordinates of the prior's box. If moduli and permeabilities scale as
+    the similarity law says, the displacements stay the same, and so do these in logarithmic coordinates.
+    Between runs they are averages, as the forces of `Tangent` are.
+    """
+
+    space: ParameterSpace
+    runs: tuple[ModelRun, ...]
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        return {"tangent_at": [[float(value) for value in run.theta] for run in self.runs]}
+
+    def predict_m(self, theta: ArrayLike) -> Array:
+        """Returns displacements since the first image (n, t - 1, p, 2) [m] at theta (n, d)."""
+        unit = self.space.box.to_unit(np.atleast_2d(np.asarray(theta, dtype=float)))
+        changes = [unit - self.space.box.to_unit(run.theta) for run in self.runs]
+        weights = np.array([1.0 / (np.sum(change**2, axis=1) + AT_A_RUN) for change in changes])
+        shares = weights / weights.sum(axis=0)
+        near = zip(self.runs, shares, changes, strict=True)
+        return np.asarray(sum(_markers_near(*each) for each in near))
+
+
+def _markers_near(run: ModelRun, share: Array, change: Array) -> Array:
+    """Returns displacements (n, t - 1, p, 2) [m] by the derivatives of a single run, times shares (n,).
+
+    change : differences (n, d) from the run in coordinates of the box
+    """
+    here_m, by_m = run.markers_m, run.marker_slopes_m
+    assert here_m is not None
+    assert by_m is not None
+    moved_m = (share[:, None] * change) @ by_m.reshape(-1, change.shape[1]).T
+    return np.multiply.outer(share, here_m) + moved_m.reshape(len(share), *here_m.shape)

@@ -83,11 +83,7 @@ class SetFit:
 
 def as_json(set_fit: SetFit) -> dict[str, Any]:
     """Returns a fit in JSON's types."""
-    assert set_fit.run.slopes_n is not None
-    run = {
-        "theta": set_fit.run.theta.tolist(), "force_n": set_fit.run.force_n.tolist(),
-        "slopes_n": set_fit.run.slopes_n.tolist(),
-    }  # fmt: skip
+    run = {name: value.tolist() for name, value in vars(set_fit.run).items() if value is not None}
     return {
         "fit": stored(set_fit.fit), "run": run, "runs": set_fit.runs, "settled": set_fit.settled,
         "off_n": set_fit.correction_n.tolist(),

@@ -3,6 +3,7 @@
 from bayeskin.recordings.bins import BIN_WIDTH_S, bin_recording, covered_s, fitting_width_s, uniform_edges
 from bayeskin.recordings.columns import Stated, stated_unit
 from bayeskin.recordings.describe import describe, describe_json
+from bayeskin.recordings.markers import read_markers
 from bayeskin.recordings.motion import idealised_motion, motion_of, recorded_motion
 from bayeskin.recordings.noise import PhaseNoise, jumps_of, phase_noise, summarise
 from bayeskin.recordings.noise_analysis import NoiseAnalysis, analyse
@@ -26,6 +27,7 @@ __all__ = [
     "jumps_of",
     "motion_of",
     "phase_noise",
+    "read_markers",
     "read_recording",
     "read_tables",
     "recorded_motion",

@@ -35,6 +35,7 @@ class Reading:
     columns : the column of each quantity; none for a file of bayeskin
     factors : the factor from the numbers in the file to SI, negative where the sign was turned
     zero_m : the displacement in the file that became zero
+    start_s : the time in the file that became zero
     """
 
     recording: Recording
@@ -42,6 +43,7 @@ class Reading:
     columns: Mapping[str, Column] = field(default_factory=dict)
     factors: Mapping[str, float] = field(default_factory=dict)
     zero_m: float = 0.0
+    start_s: float = 0.0
 
 
 def read_recording(
@@ -198,7 +200,9 @@ def _reading(
         sha256,
         remarks,
     )
-    return Reading(recording, label, quantities.columns, quantities.factors, quantities.zero_m)
+    return Reading(
+        recording, label, quantities.columns, quantities.factors, quantities.zero_m, float(time_s[0])
+    )
 
 
 def _read_stored(path: Path) -> Recording:

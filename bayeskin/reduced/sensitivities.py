@@ -64,7 +64,10 @@ class _Derivatives:
 
 
 class ReducedGradients:
-    """Differentiates the accepted steps of a reduced run; `force_n` holds the derivatives at each step.
+    """Differentiates the accepted steps of a reduced run.
+
+    `force_n` holds the derivatives of the force at each step, (r,), and `states` those of the unknowns,
+    (r, k + m).
 
     changes : change of each parameter, by its name; a derivative is the force in newtons for this change
     space_at : function that returns the run's space for given parameters, whose lengths move the nodes
@@ -109,6 +112,7 @@ class ReducedGradients:
         )
         self._scale = np.repeat(least[:, None], len(self._varied.mu), axis=1)
         self.force_n: list[Array] = [np.zeros(len(changes))]
+        self.states: list[Array] = [self._start.slopes.x[: len(changes)]]
 
     def _at_rest(self, change: float) -> _Derivatives:
         eq, (k, m) = self._equations, self._equations.space.modes
@@ -123,13 +127,14 @@ class ReducedGradients:
         return _Derivatives(state, slopes.Slopes(x, np.zeros((r, n)), pressure, memory), lost)
 
     def follow(self, step: Step) -> None:
-        """Differentiates an accepted step and appends the derivatives (r,) of its force [N] to `force_n`."""
+        """Differentiates an accepted step and appends its derivatives to `force_n` and `states`."""
         for stage in step.stages:
             known, force = self._differentiate(stage)
             self._known[id(stage.state)] = known
         if abs(step.state.time_s - self._equations.starts_s) < 1e-6:
             self._zero_n = force
         self.force_n.append(force)
+        self.states.append(known.slopes.x[: len(self.names)].copy())
         self._known = dict(list(self._known.items())[-REMEMBERED_STATES:])
 
     def _derivatives_of(self, state: State) -> _Derivatives:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -22,11 +22,13 @@ from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.reduced.region import REGION, Stability, outside
 from bayeskin.reduced.sensitivities import ReducedGradients
-from bayeskin.types import PadMotion, Simulation, frozen_array
+from bayeskin.types import Array, PadMotion, Simulation, frozen_array
 
 TOLERANCE = ModelSpec.tolerance  # the full model's default
 ESTIMATES = 12  # approximate number of states, besides the corners, at which the error is estimated
 INSIDE_OUT = "the mesh is inverted between the cubature points; run the full model"
+# time [s], coefficients (k + m,) of the reduced state, and their derivatives (r, k + m) or None
+OnReducedState = Callable[[float, Array, Array | None], None]
 SAFETY = 3.0  # factor on the error that the residual gives; chosen on the skins of docs/reduced.md
 
 
@@ -39,6 +41,7 @@ def simulate_reduced(
     geometry: Geometry | None = None,
     estimate: bool = False,
     on_state: OnState | None = None,
+    on_reduced_state: OnReducedState | None = None,
     least_stiffness: float = REGION.least_stiffness,
 ) -> Simulation:
     """Runs a reduced model over the whole motion and returns the simulation.
@@ -53,6 +56,7 @@ def simulate_reduced(
     estimate : True to estimate the error of the force, which takes longer than the run
     on_state : function that is called with time [s], unknowns of the full model (dofs,) and force [N] of each
         step of the test
+    on_reduced_state : function that is called with the reduced state of each step of the test
     least_stiffness : stiffness, relative to rest, below which the skin counts as near folding
 
     The simulation has status "failed" and a message where the run fails, where it leaves the trained region,
@@ -71,6 +75,8 @@ def simulate_reduced(
         stats = run.stats
         if on_state is not None:
             run.show(history, on_state)
+        if on_reduced_state is not None:
+            run.show_reduced(history, on_reduced_state)
         if estimate and not message:
             stats["error_estimate_n"] = run.estimated_error_n(history)
             if not np.isfinite(stats["error_estimate_n"]):
@@ -168,6 +174,13 @@ class _Run:
             time_s = step.state.time_s - equations.starts_s
             if time_s > -1e-6:
                 on_state(max(time_s, 0.0), basis.nodal(step.state.x), step.force_n - equations.zero_n)
+
+    def show_reduced(self, history: _History, on_reduced_state: OnReducedState) -> None:
+        """Calls `on_reduced_state` for each step of the test."""
+        test = history.steps[-len(history.time_s) :]
+        slopes = [None] * len(test) if self.slopes is None else self.slopes.states[-len(test) :]
+        for time_s, step, by in zip(history.time_s, test, slopes, strict=True):
+            on_reduced_state(time_s, step.state.x, by)
 
     def estimated_error_n(self, history: _History) -> float:
         """Returns the estimated RMS error of the force [N], from some states of the test."""

@@ -13,6 +13,7 @@ from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
 from bayeskin.report.mismatch import figure_candidates, figure_contributions, figure_located
+from bayeskin.report.on_skin import figure_on_skin
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
 from bayeskin.report.profiles import figure_profiles
@@ -40,6 +41,7 @@ __all__ = [
     "figure_located",
     "figure_map_check",
     "figure_model_check",
+    "figure_on_skin",
     "figure_population",
     "figure_posterior",
     "figure_prior_predictive",

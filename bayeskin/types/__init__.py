@@ -8,6 +8,7 @@ name each dataclass of this package, so a dataclass keeps its name.
 from bayeskin.types.arrays import Array, FreezesArrays, frozen_array
 from bayeskin.types.design import Design
 from bayeskin.types.joint import Span
+from bayeskin.types.markers import Markers
 from bayeskin.types.parameters import STIFFEST_BELOW, Correlation, Parameter, ParameterSpace
 from bayeskin.types.protocol import PHASE_IN_WORDS, PHASE_KINDS, PadMotion, Phase, PhaseKind
 from bayeskin.types.provenance import Provenance
@@ -26,6 +27,7 @@ __all__ = [
     "Design",
     "FreezesArrays",
     "Jumps",
+    "Markers",
     "Observation",
     "PadMotion",
     "Parameter",

@@ -42,20 +42,28 @@ class Simulation(FreezesArrays):
     gradient_n: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def at(self, time_s: ArrayLike) -> Array:
-        """Returns the force [N] at given times.
+        """Returns the force [N] at given times, by `between_steps`."""
+        return self.between_steps(self.force_n, time_s)
 
-        Between time steps, it is a monotone cubic (PCHIP) inside each phase. It is continuous at corners.
+    def between_steps(self, values: Array, time_s: ArrayLike) -> Array:
+        """Returns values at given times (q,), (q, ...), from values at the time steps (n, ...).
+
+        Between time steps, they are a monotone cubic (PCHIP) inside each phase. They are continuous at
+        corners.
         """
-        from scipy.interpolate import PchipInterpolator
+        from scipy.interpolate import PchipInterpolator, make_interp_spline
 
         query = np.asarray(time_s, dtype=float)
-        out = np.interp(query, self.time_s, self.force_n)
+        if len(self.time_s) == 1:  # a run that failed in its first step
+            return np.broadcast_to(values[0], query.shape + values.shape[1:]).copy()
+        within = np.clip(query, self.time_s[0], self.time_s[-1])
+        out = np.asarray(make_interp_spline(self.time_s, values, k=1)(within))
         breaks = np.unique(np.concatenate([[0], np.flatnonzero(self.corner), [len(self.time_s) - 1]]))
         for a, b in pairwise(breaks):
             inside = (query >= self.time_s[a]) & (query <= self.time_s[b])
             if b - a >= 2 and inside.any():
                 steps = slice(a, b + 1)
-                out[inside] = PchipInterpolator(self.time_s[steps], self.force_n[steps])(query[inside])
+                out[inside] = PchipInterpolator(self.time_s[steps], values[steps])(query[inside])
         return out
 
     def bin_means(self, edges_s: ArrayLike) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from bayeskin.forward.posterior import posterior_of
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.surrogates import load_surrogate
-from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
+from bayeskin.types import Array, BinnedForce, Design, PadMotion, Surrogate
 from bayeskin.workflow.engine import Run
+from bayeskin.workflow.marker_model import likelihood_of_markers
 from bayeskin.workflow.model import model_spec
 
 ARTICLE_HOLDS_S = (
@@ -22,20 +24,27 @@ ARTICLE_HOLDS_S = (
 )  # the article's script has these; its text says 20-75 and 98-140
 
 
-def log_posterior_of(run: Run, surrogate: Surrogate, binned: BinnedForce, motion: PadMotion) -> LogPosterior:
-    """Returns the log-posterior that the configuration asks for, of a recording's bins and protocol."""
+def log_posterior_of(
+    run: Run, surrogate: Surrogate, binned: BinnedForce, motion: PadMotion, design: Design
+) -> LogPosterior:
+    """Returns the log-posterior that the configuration asks for, of a recording's bins and protocol.
+
+    design : the design of the surrogate, at whose points the displacements of markers are computed too
+    """
     config = run.config
     noise = {name: bounds for name, bounds in config.noise if bounds is not None}
     windows = None if config.fit.windows_s is None else tuple(config.fit.windows_s)
     space = parameter_space(config, run.config_path)
-    return posterior_of(surrogate, model_spec(run), binned, motion, NoisePriors(**noise), space, windows)
+    of_force = posterior_of(surrogate, model_spec(run), binned, motion, NoisePriors(**noise), space, windows)
+    return replace(of_force, markers=likelihood_of_markers(run, design, binned, motion))
 
 
 def refined_posterior(run: Run) -> LogPosterior:
     """Returns the log-posterior with the surrogate after the check at the most probable point."""
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
-    return log_posterior_of(run, load_surrogate(run.at("map", "surrogate.h5")), binned, motion)
+    design = storage.load(run.at("map", "design.h5"), Design)
+    return log_posterior_of(run, load_surrogate(run.at("map", "surrogate.h5")), binned, motion, design)
 
 
 def rmse_table(log_posterior: LogPosterior, force_n: Array) -> dict[str, Any]:

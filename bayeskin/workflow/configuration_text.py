@@ -57,10 +57,15 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
 
 def configuration_text(
     name: str, references: Sequence[str], description: str, section: list[str], ready: bool,
-    stated: DeviceFile | None,
+    stated: DeviceFile | None, markers: str | None = None,
 ) -> str:  # fmt: skip
-    """Returns the text of the configuration. Raises InputError for two recordings of one name."""
+    """Returns the text of the configuration. Raises InputError for two recordings of one name.
+
+    markers : file of the tracks of a single recording
+    """
     given = [{"file": reference} for reference in references]
+    if markers is not None:
+        given[0]["markers"] = markers
     sections: dict[str, Any] = {"recording": given[0]} if len(given) == 1 else {"recordings": given}
     config = config_of({"name": name, **sections}, "recordings")
     table = "[recording]" if len(given) == 1 else "[[recordings]]"
@@ -72,6 +77,11 @@ def configuration_text(
                 table,
                 f"file = {_quoted(recording.file)}  # path relative to this file",
                 f'# protocol = {_quoted(recording.protocol)}  # or "recorded": as measured, but slower',
+                *(
+                    [f"markers = {_quoted(recording.markers)}  # tracks of points"]
+                    if recording.markers
+                    else []
+                ),
             ]
             for recording in config.each_recording
         ),

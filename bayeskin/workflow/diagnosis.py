@@ -32,6 +32,7 @@ from bayeskin.workflow.diagnosis_figures import draw
 from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, depends_on, open_context
 from bayeskin.workflow.diagnosis_text import in_words
 from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run, run_stages
+from bayeskin.workflow.importing import markers_beside
 from bayeskin.workflow.model import model_spec
 from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.reducing import reduced_file
@@ -82,6 +83,8 @@ def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
     width_s = max(fitting_width_s(read_recording(file)) for file in sources)
     stems, folder = "-".join(file.stem for file in sources), source.resolve().parent
     files = [{"file": os.path.relpath(file.resolve(), folder)} for file in sources]
+    if len(sources) == 1 and markers_beside(source).exists():
+        files[0]["markers"] = os.path.relpath(markers_beside(source.resolve()), folder)
     given: dict[str, Any] = {"recording": files[0]} if len(files) == 1 else {"recordings": files}
     given["fit"] = {"bin_width_s": width_s}
     if device is not None:

@@ -16,6 +16,7 @@ from bayeskin.mismatch.gains import gains
 from bayeskin.mismatch.hypotheses import Family
 from bayeskin.mismatch.locate import Window
 from bayeskin.mismatch.misfit import misfit_n
+from bayeskin.mismatch.on_skin import OnSkin
 from bayeskin.mismatch.search_record import Names, SearchResult
 from bayeskin.types import Span
 from bayeskin.types.joint import recording_at
@@ -131,7 +132,21 @@ def _fit_entry(assessed: AssessedFit, split_s: float | None) -> dict[str, Any]:
         "log_evidence": fit.log_evidence,
         "theta": drawn.summary,
         "sampled": {"settled": drawn.settled, "rhat": drawn.rhat, "effective": drawn.effective},
+        **({} if assessed.on_skin is None else {"on_skin": _on_skin_entry(assessed.on_skin)}),
     }
+
+
+def _on_skin_entry(located: OnSkin) -> dict[str, Any]:
+    """Returns the entry of the residuals of markers; the longest significant vectors come first."""
+    length_m = np.linalg.norm(located.vector_m, axis=1)
+    order = [int(i) for i in np.argsort(-length_m) if located.significant[i]]
+    return {
+        "points": len(length_m), "significant": len(order), "rms_m": located.rms_m,
+        "largest": [
+            {"place_m": located.place_m[i].tolist(), "residual_m": located.vector_m[i].tolist()}
+            for i in order[:10]
+        ],
+    }  # fmt: skip
 
 
 def _full_model_entry(check: FullModelCheck | str) -> dict[str, Any]:

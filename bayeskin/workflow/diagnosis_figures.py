@@ -89,6 +89,9 @@ def draw(
     for number in range(len(binned.parts)):
         of_recording = _of_recording(context, diagnosis, number)
         figures |= {figure_name(name, number): figure for name, figure in of_recording}
+    for name, fit in (("on_skin_before", diagnosis.before), ("on_skin_after", diagnosis.after)):
+        if fit.on_skin is not None:
+            figures[name] = report.figure_on_skin(fit.on_skin, context.forward.spec.geometry)
     if diagnosis.remainder is not None:
         figures["discrepancy"] = report.figure_discrepancy(binned, motion, diagnosis.remainder.discrepancy)
     return [

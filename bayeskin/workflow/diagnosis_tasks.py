@@ -23,6 +23,7 @@ from bayeskin.recordings import analyse, bin_recording, jumps_of
 from bayeskin.recordings.join import join_bins, join_jumps
 from bayeskin.store import Store
 from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording
+from bayeskin.workflow.recording import recorded_markers
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,12 @@ class ContextSource:
 def open_context(source: ContextSource) -> DiagnosisContext:
     """Returns the context from the files and settings of a source."""
     binned, jumps, motion = calm_bins(source.recording)
-    forward = forward_model(source.model, source.spec, motion, binned.edges_s)
+    markers = recorded_markers(source.recording)
+    forward = forward_model(source.model, source.spec, motion, binned.edges_s, markers)
     noise = dict(source.noise)
-    return DiagnosisContext(binned, jumps, motion, forward, source.base, source.seed, noise, source.shared)
+    return DiagnosisContext(
+        binned, jumps, motion, forward, source.base, source.seed, noise, source.shared, markers
+    )
 
 
 def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
@@ -120,4 +124,5 @@ def depends_on(context: DiagnosisContext) -> list[Any]:
         sorted(context.stated_noise.items()), sorted(context.shared),
         context.forward.hash, asdict(context.binned), asdict(context.motion),
         [repr(ParameterSpace(m.parameters).without_texts) for m in context.known.values()],
+        *([] if context.markers is None else [asdict(context.markers)]),
     ]  # fmt: skip

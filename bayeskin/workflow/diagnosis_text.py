@@ -28,6 +28,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
     for recording in answer["recordings"]:
         lines += [agreement_in_words(recording), informed_in_words(recording)]
     lines += [_fit_line(label, answer["fit"][label]) for label in ("before", "after")]
+    lines += [_skin_line(label, answer["fit"][label]) for label in ("before", "after")
+              if "on_skin" in answer["fit"][label]]  # fmt: skip
     lines.append(full_run_in_words(answer["full_model"]))
     after = answer["fit"]["after"]
     if not (after["emulator"]["settled"] and after["sampled"]["settled"]):
@@ -39,6 +41,13 @@ def in_words(answer: Mapping[str, Any]) -> str:
         lines.append(f"gain of log-evidence by single mechanisms: {best}")
     lines.append(f"outputs in {answer['folder']}")
     return "\n".join(lines)
+
+
+def _skin_line(label: str, fit: Mapping[str, Any]) -> str:
+    """Returns a line about the markers that move otherwise than a fit says."""
+    located = fit["on_skin"]
+    line = f"{label}: at {located['significant']} of {located['points']} markers the skin moves otherwise"
+    return f"{line}, {1e3 * located['rms_m']:.3f} mm RMS at the largest opening"
 
 
 def _fit_line(label: str, fit: Mapping[str, Any]) -> str:

@@ -8,9 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bayeskin import storage
 from bayeskin.errors import InputError
 from bayeskin.json_files import plain
+from bayeskin.number_format import number
 from bayeskin.recordings import (
     ALL,
     Reading,
@@ -18,11 +21,13 @@ from bayeskin.recordings import (
     describe,
     describe_json,
     phase_noise,
+    read_markers,
     read_tables,
     segment,
     shown,
     stated_unit,
 )
+from bayeskin.types import Markers
 from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.output_paths import check_ending
 
@@ -34,6 +39,7 @@ def import_recording(
     sheet: str | None = None,
     units: Sequence[str] = (),
     zero: bool | None = None,
+    markers: Path | None = None,
     **columns: str | None,
 ) -> dict[str, Any]:
     """Reads `file`, writes it to `out` as an HDF5 file of bayeskin, and returns the command's answer.
@@ -43,23 +49,53 @@ def import_recording(
 
     units : texts such as "force=mN" or "displacement=-mm", which also turns the sign
     zero : True makes the first displacement zero, False keeps the zero of the file
+    markers : file with tracks of points on the skin, which are written beside `out` (`markers_beside`)
     columns : the name or number of the column of `time`, `displacement` and `force`
 
     Raises InputError, with nothing written, for a file that is no recording of a test or is not clear.
     """
     check_ending(out, ".h5")
+    if markers is not None and sheet == ALL:
+        raise InputError(
+            f"--markers {markers}",
+            f"markers belong to a single table, not to --sheet {ALL}",
+            "choose a table with --sheet NAME",
+        )
     stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
     readings = read_tables(file, sheet=sheet, stated=stated)
     outs = [out] if sheet != ALL else _outs(out, [reading.table for reading in readings])
     answers = [_answer(reading, to, stated) for reading, to in zip(readings, outs, strict=True)]
+    tracks = None if markers is None else read_markers(markers, readings[0].recording, readings[0].start_s)
     for reading, to in zip(readings, outs, strict=True):
         for note in reading.recording.notes:
             reporter.log(f"{shown(to.name)}: {note}" if sheet == ALL else note)
         storage.save(to, reading.recording)
+    if tracks is not None:
+        storage.save(markers_beside(out), tracks)
+        answers[0] |= _answer_of_markers(tracks, markers_beside(out), answers[0]["text"])
     if sheet != ALL:
         return plain({"ok": True, **answers[0]})
     text = "\n\n".join(answer.pop("text") for answer in answers)
     return plain({"ok": True, "recordings": answers, "text": text})
+
+
+def markers_beside(recording: Path) -> Path:
+    """Returns the file of the tracks that were imported with a recording."""
+    return recording.with_name(f"{recording.stem}-markers.h5")
+
+
+def _answer_of_markers(markers: Markers, out: Path, text: str) -> dict[str, Any]:
+    """Returns what the command says of tracks, after the text on their recording."""
+    facts = {
+        "out": shown(out), "points": len(markers.points), "images": len(markers.time_s),
+        "first_s": markers.time_s[0], "last_s": markers.time_s[-1],
+        "not_seen": int(np.sum(~np.isfinite(markers.position_m[..., 0]))),
+    }  # fmt: skip
+    sentence = (
+        f"markers: {facts['points']} points in {facts['images']} images, {number(markers.time_s[0])} to "
+        f"{number(markers.time_s[-1], 5)} s\nwritten to {facts['out']}"
+    )
+    return {"markers": facts, "text": f"{text}\n\n{sentence}"}
 
 
 def _units(texts: Sequence[str]) -> Mapping[str, Any]:

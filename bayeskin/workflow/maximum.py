@@ -70,10 +70,10 @@ def _find_maximum(run: Run) -> Mapping[str, Any]:
     config = run.config
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     refining, full = Refining(run, binned, "design", "train"), _FullModel(run)
+    log_posterior = log_posterior_of(run, refining.surrogate, binned, full.motion, refining.design)
     refined = inference.refine_map(
-        log_posterior_of(run, refining.surrogate, binned, full.motion), full, refining.retrain, config.seed,
-        config.map.starts, config.map.evaluations,
-    )  # fmt: skip
+        log_posterior, full, refining.retrain, config.seed, config.map.starts, config.map.evaluations
+    )
     refining.save("map")
     _draw_check(run, binned, refined)
     return {**_search_summary(refined, binned), "polished": _polish(full, refined)}

@@ -34,6 +34,7 @@ from bayeskin.workflow.configuration_text import (
     surrogate_section,
     wide_bins_section,
 )
+from bayeskin.workflow.importing import markers_beside
 from bayeskin.workflow.output_paths import check_ending
 from bayeskin.workflow.reducing import find_reduced
 from bayeskin.workflow.shipping import shipped_for
@@ -44,7 +45,8 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
 
     By default it lies beside the first recording. The configuration of a single recording uses a shipped
     surrogate where one was trained on the recording's protocol and device. Otherwise it has a design of its
-    own, by the reduced model where the device has one. The sections of the file `device` are written into it.
+    own, by the reduced model where the device has one. Tracks that were imported with a single recording are
+    used too. The sections of the file `device` are written into it.
     Raises InputError, with nothing written, for a file that is no recording of a test, two files of one name,
     an impossible device, or an `out` that exists already.
     """
@@ -63,15 +65,20 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     )
     geometry, single = _geometry(stated), len(files) == 1
     width_s = max(map(fitting_width_s, recordings))
-    usual = single and not geometry.sd_m and width_s == BIN_WIDTH_S  # shipped surrogates need all of these
+    tracks = markers_beside(files[0]) if single and markers_beside(files[0]).exists() else None
+    # shipped surrogates need all of these
+    usual = single and not geometry.sd_m and width_s == BIN_WIDTH_S and tracks is None
     surrogate = shipped_for(motions[0], geometry.geometry) if usual else None
     reduced = None if surrogate else _reduced_for(motions, geometry.geometry, out)
     source, section = _surrogate_source(surrogate, reduced)
-    references = [Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix() for file in files]
+    references = [_reference(file, out) for file in files]
     _refuse_names(references)
     if width_s != BIN_WIDTH_S:
         section = [*wide_bins_section(width_s), "", *section]
-    text = configuration_text(_name(out), references, description, section, surrogate is not None, stated)
+    text = configuration_text(
+        _name(out), references, description, section, surrogate is not None, stated,
+        None if tracks is None else _reference(tracks, out),
+    )  # fmt: skip
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
@@ -81,6 +88,11 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     return plain(
         {**answer, "text": f"{description}\n\nwritten to {out}, with {source}\nnext: bayeskin run {out}"}
     )
+
+
+def _reference(file: Path, out: Path) -> str:
+    """Returns the path of a file relative to the configuration `out`."""
+    return Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
 
 
 def new_demo(out: Path | None = None) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from bayeskin import report, storage
 from bayeskin.config import RecordingConfig
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec
+from bayeskin.finite_element.mesh_change import mesh_change
+from bayeskin.finite_element.surface_points import refuse_outside
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.recordings import (
     NoiseAnalysis,
@@ -23,6 +25,7 @@ from bayeskin.recordings import (
     describe_json,
     idealised_motion,
     motion_of,
+    read_markers,
     read_recording,
     recorded_motion,
     segment,
@@ -30,10 +33,12 @@ from bayeskin.recordings import (
     uniform_edges,
 )
 from bayeskin.recordings.join import join_bins, join_motions, join_samples, spans_of
-from bayeskin.types import BinnedForce, PadMotion, Phase, Recording
+from bayeskin.types import BinnedForce, Markers, PadMotion, Phase, Recording
 from bayeskin.types.joint import figure_name
 from bayeskin.workflow.engine import Run, Stage
 from bayeskin.workflow.provenance import caption
+
+MARKERS = "markers.h5"  # in the folder of the stage; absent where the recording has no markers
 
 
 def pad_motion(
@@ -96,7 +101,10 @@ def _prepare_recordings(run: Run) -> Mapping[str, Any]:
         motion = join_motions([part.motion for part in parts], spans)
         binned = join_bins([part.binned for part in parts], spans)
     _refuse_empty_windows(run, binned)
+    markers = _markers(run, samples, motion)
     storage.save(run.at("recording", "recording.h5"), samples)
+    if markers is not None:
+        storage.save(run.at("recording", MARKERS), markers)
     storage.save(run.at("recording", "motion.h5"), motion)
     storage.save(run.at("recording", "binned.h5"), binned)
     for number, (recording, part) in enumerate(zip(recordings, parts, strict=True)):
@@ -106,6 +114,29 @@ def _prepare_recordings(run: Run) -> Mapping[str, Any]:
         return facts[0]
     total = {key: sum(fact[key] for fact in facts) for key in ("samples", "duration_s")}
     return {**facts[0], "name": samples.name, "sha256": samples.sha256, **total, "recordings": facts}
+
+
+def _markers(run: Run, recording: Recording, motion: PadMotion) -> Markers | None:
+    """Returns the tracks of points that belong to the recording, or None where there are none.
+
+    Two runs of the full model show by how much a finer mesh changes their displacements.
+    Raises InputError for tracks of another test, and for points outside the skin of the device.
+    """
+    file = run.config.each_recording[0].markers
+    if file is None:
+        return None
+    markers = read_markers(run.beside(file), recording)
+    geometry = run.config.geometry(run.config_path).geometry
+    refuse_outside(geometry, markers.reference_m, str(run.beside(file)))
+    run.reporter.log("markers: two runs of the full model show the error of its mesh")
+    change_m = mesh_change(replace(run.config.model.spec(), geometry=geometry), motion, markers)
+    return replace(markers, mesh_change_m=change_m)
+
+
+def recorded_markers(folder: Path) -> Markers | None:
+    """Returns the tracks of points in the folder of this stage, or None where there are none."""
+    file = folder / MARKERS
+    return storage.load(file, Markers) if file.exists() else None
 
 
 def _named(run: Run, section: RecordingConfig) -> Recording:
@@ -135,9 +166,16 @@ def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
 
 def _files(run: Run) -> Iterable[Path]:
     """Returns the files that the stage reads."""
-    return [run.beside(section.file) for section in run.config.each_recording]
+    sections = run.config.each_recording
+    files = [section.file for section in sections] + [s.markers for s in sections if s.markers is not None]
+    return [run.beside(file) for file in files]
 
 
 STAGE = Stage(
-    "recording", "reads the recordings", (), ("recording", "model", "fit"), _prepare_recordings, _files
+    "recording",
+    "reads the recordings",
+    (),
+    ("recording", "model", "fit", "device", "tissue"),
+    _prepare_recordings,
+    _files,
 )

@@ -126,7 +126,7 @@ def _choose_wave(
     if config.design.coarse == "reduced" and number >= FIRST_OF_POSTERIOR:
         run.reporter.log(f"wave {number + 1}: a short run of the sampler locates the posterior")
         nearest = design.theta[int(np.argmax(np.where(design.training, weights, 0.0)))]
-        draws = _posterior_draws(run, log_posterior_of(run, surrogate, binned, motion), nearest)
+        draws = _posterior_draws(run, log_posterior_of(run, surrogate, binned, motion, design), nearest)
         inputs = surrogate.inputs(draws)
         return posterior_wave(space, draws, inputs, count, config.design.held_out, number, config.seed)
     floor_n = noise_floor_n(binned, fitted)
