@@ -43,8 +43,8 @@ def test_numbers_of_another_kind_are_no_recording() -> None:
 
 # These names stand in files that have been written.
 STORED = {
-    "BinnedForce", "Design", "Jumps", "PadMotion", "Parameter", "ParameterSpace", "Phase", "Prediction",
-    "Provenance", "Recording", "Simulation",
+    "BinnedForce", "Design", "Jumps", "Markers", "PadMotion", "Parameter", "ParameterSpace", "Phase",
+    "Prediction", "Provenance", "Recording", "Simulation",
 }  # fmt: skip
 
 
