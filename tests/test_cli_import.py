@@ -158,3 +158,32 @@ def test_a_pull_without_a_hold_is_imported_and_says_what_it_cannot_tell(
     assert [sentence.split(",")[0] for sentence in said["cannot_tell"]] == [
         "There is no hold", "There is no unloading",
     ]  # fmt: skip
+
+
+def test_several_files_go_to_a_folder_each_under_its_own_name(bayeskin: Command, tmp_path: Path) -> None:
+    for name in ("before.csv", "after.csv"):
+        (tmp_path / name).write_bytes(text(NAMED, ","))
+    files = tmp_path / "before.csv", tmp_path / "after.csv"
+    code, out, err = bayeskin("import", *files, "-o", tmp_path / "both", "--json")
+    assert code == 0
+    assert [Path(entry["out"]).name for entry in json.loads(out)["recordings"]] == ["before.h5", "after.h5"]
+    assert "after.h5: column" in err
+    for name in ("before.h5", "after.h5"):
+        np.testing.assert_allclose(storage.load(tmp_path / "both" / name, Recording).time_s[-1], TIME_S[-1])
+
+
+def test_where_one_of_several_files_is_wrong_nothing_is_written(bayeskin: Command, tmp_path: Path) -> None:
+    (tmp_path / "good.csv").write_bytes(text(NAMED, ","))
+    (tmp_path / "bad.csv").write_text("nothing of a test\n")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "good.csv").write_bytes(text(NAMED, ","))
+    good, bad, same = tmp_path / "good.csv", tmp_path / "bad.csv", tmp_path / "other" / "good.csv"
+    for files, out, says in (
+        ((good, bad), "both", "bad.csv"),
+        ((good, same), "both", "good.h5"),
+        ((good, bad), "both.h5", "folder"),
+    ):
+        assert_refused(bayeskin("import", *files, "-o", tmp_path / out), says)
+        assert not (tmp_path / out).exists()
+    refused = bayeskin("import", good, bad, "-o", tmp_path / "both", "--markers", bad)
+    assert_refused(refused, "single recording")

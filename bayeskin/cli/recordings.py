@@ -15,8 +15,8 @@ from bayeskin.errors import InputError
 
 
 @click.command("import", short_help="Read a recording (a table or a workbook), write it as HDF5.")
-@click.argument("file", type=PATH)
-@click.option("-o", "out", required=True, type=PATH, help="HDF5 file to write.")
+@click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
+@click.option("-o", "out", required=True, type=PATH, help="HDF5 file to write; a folder for several files.")
 @click.option("--sheet", metavar="NAME", help="One of several tables, or 'all' for one recording each.")
 @click.option("--time", metavar="COLUMN", help="Name or number of the column of time.")
 @click.option("--displacement", metavar="COLUMN", help="Name or number of the column of displacement.")
@@ -27,7 +27,7 @@ from bayeskin.errors import InputError
 @click.option("--markers", type=PATH, metavar="FILE", help="Tracks of points on the skin: time, point, x, y.")
 @click.option("--zero/--no-zero", default=None, help="Subtract the first displacement, or keep it.")
 @answered
-def import_(**options: Any) -> Mapping[str, Any]:
+def import_(files: tuple[Path, ...], markers: Path | None, **options: Any) -> Mapping[str, Any]:
     """Read a recording and write it in SI units as HDF5.
 
     FILE is a table (csv, tsv, txt, dat, asc, tra, lvm, npy) or a workbook (xlsx, xls) of any test machine.
@@ -39,6 +39,8 @@ def import_(**options: Any) -> Mapping[str, Any]:
     With --markers, tracks of points on the skin are read too, from a table with the columns time (s), point,
     x and y (mm). They are checked and written beside the recording, as OUT-markers.h5.
 
+    Several files are read in the same way, and each becomes a file in the folder OUT.
+
     \b
     Example:
       bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
@@ -46,11 +48,17 @@ def import_(**options: Any) -> Mapping[str, Any]:
       bayeskin import series.xlsx --sheet all -o runs/series.h5
       bayeskin import arm.csv --displacement Position --unit force=gf --zero -o runs/arm.h5
       bayeskin import arm.csv --markers tracks.csv -o runs/arm.h5
+      bayeskin import visit-1.csv visit-2.csv -o runs/visits
     """
-    from bayeskin.workflow.importing import import_recording
+    from bayeskin.workflow.importing import import_recording, import_recordings
 
+    if len(files) > 1 and markers is not None:
+        problem = "markers belong to a single recording"
+        raise InputError(f"--markers {markers}", problem, "import each recording with its markers alone")
     with Terminal() as terminal:
-        return import_recording(terminal, **options)
+        if len(files) > 1:
+            return import_recordings(terminal, files, **options)
+        return import_recording(terminal, files[0], markers=markers, **options)
 
 
 @click.command(short_help="Write a configuration for a recording of your own.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from bayeskin.recordings import (
 )
 from bayeskin.types import Markers
 from bayeskin.workflow.engine import Reporter
-from bayeskin.workflow.output_paths import check_ending
+from bayeskin.workflow.output_paths import check_ending, check_folder
 
 
 def import_recording(
@@ -54,6 +54,50 @@ def import_recording(
 
     Raises InputError, with nothing written, for a file that is no recording of a test or is not clear.
     """
+    stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
+    imported = _read(file, out, sheet, stated, markers)
+    _write(imported, reporter, named=sheet == ALL)
+    return _answer(imported) if sheet == ALL else plain({"ok": True, **imported[0].answer})
+
+
+def import_recordings(
+    reporter: Reporter, files: Sequence[Path], out: Path, sheet: str | None = None, units: Sequence[str] = (),
+    zero: bool | None = None, **columns: str | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Reads several files in the same way, and writes each to a folder under its own name, ending in .h5.
+
+    out : the folder; the other arguments are those of `import_recording`
+    Raises InputError, with nothing written, where one of the files cannot be imported.
+    """
+    check_folder("-o", out)
+    if out.suffix == ".h5":
+        raise InputError(f"-o {out}", "several recordings go to a folder", "use the name of a folder")
+    outs = [out / f"{file.stem}.h5" for file in files]
+    for file, to in zip(files, outs, strict=True):
+        if outs.count(to) > 1:
+            raise InputError(file, f"several files would become {to.name}", "import one of them alone")
+    stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
+    imported = [
+        item for file, to in zip(files, outs, strict=True) for item in _read(file, to, sheet, stated, None)
+    ]
+    _write(imported, reporter, named=True)
+    return _answer(imported)
+
+
+@dataclass(frozen=True)
+class _Imported:
+    """A recording that can be written to `out`, its tracks of points, and what the command says of it."""
+
+    reading: Reading
+    out: Path
+    answer: dict[str, Any]
+    markers: Markers | None = None
+
+
+def _read(
+    file: Path, out: Path, sheet: str | None, stated: Stated, markers: Path | None
+) -> list[_Imported]:  # fmt: skip
+    """Returns the recordings of a file. Raises InputError where it cannot be imported."""
     check_ending(out, ".h5")
     if markers is not None and sheet == ALL:
         raise InputError(
@@ -61,22 +105,35 @@ def import_recording(
             f"markers belong to a single table, not to --sheet {ALL}",
             "choose a table with --sheet NAME",
         )
-    stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
     readings = read_tables(file, sheet=sheet, stated=stated)
     outs = [out] if sheet != ALL else _outs(out, [reading.table for reading in readings])
-    answers = [_answer(reading, to, stated) for reading, to in zip(readings, outs, strict=True)]
-    tracks = None if markers is None else read_markers(markers, readings[0].recording, readings[0].start_s)
-    for reading, to in zip(readings, outs, strict=True):
-        for note in reading.recording.notes:
-            reporter.log(f"{shown(to.name)}: {note}" if sheet == ALL else note)
-        storage.save(to, reading.recording)
-    if tracks is not None:
-        storage.save(markers_beside(out), tracks)
-        answers[0] |= _answer_of_markers(tracks, markers_beside(out), answers[0]["text"])
-    if sheet != ALL:
-        return plain({"ok": True, **answers[0]})
-    text = "\n\n".join(answer.pop("text") for answer in answers)
-    return plain({"ok": True, "recordings": answers, "text": text})
+    imported = [
+        _Imported(reading, to, _facts(reading, to, stated))
+        for reading, to in zip(readings, outs, strict=True)
+    ]
+    if markers is None:
+        return imported
+    (only,) = imported
+    tracks = read_markers(markers, only.reading.recording, only.reading.start_s)
+    facts = _facts_of_markers(tracks, markers_beside(out), only.answer["text"])
+    return [replace(only, markers=tracks, answer=only.answer | facts)]
+
+
+def _write(imported: Sequence[_Imported], reporter: Reporter, named: bool) -> None:
+    """Writes recordings and reports the notes on their reading; `named` puts the file's name before each."""
+    for item in imported:
+        for note in item.reading.recording.notes:
+            reporter.log(f"{shown(item.out.name)}: {note}" if named else note)
+        storage.save(item.out, item.reading.recording)
+        if item.markers is not None:
+            storage.save(markers_beside(item.out), item.markers)
+
+
+def _answer(imported: Sequence[_Imported]) -> dict[str, Any]:
+    """Returns the command's answer for several recordings."""
+    text = "\n\n".join(item.answer["text"] for item in imported)
+    facts = [{key: value for key, value in item.answer.items() if key != "text"} for item in imported]
+    return plain({"ok": True, "recordings": facts, "text": text})
 
 
 def markers_beside(recording: Path) -> Path:
@@ -84,7 +141,7 @@ def markers_beside(recording: Path) -> Path:
     return recording.with_name(f"{recording.stem}-markers.h5")
 
 
-def _answer_of_markers(markers: Markers, out: Path, text: str) -> dict[str, Any]:
+def _facts_of_markers(markers: Markers, out: Path, text: str) -> dict[str, Any]:
     """Returns what the command says of tracks, after the text on their recording."""
     facts = {
         "out": shown(out), "points": len(markers.points), "images": len(markers.time_s),
@@ -123,7 +180,7 @@ def _outs(out: Path, tables: Sequence[str]) -> list[Path]:
     return [out.with_name(f"{out.stem}-{name}{out.suffix}") for name in names]
 
 
-def _answer(reading: Reading, out: Path, stated: Stated) -> dict[str, Any]:
+def _facts(reading: Reading, out: Path, stated: Stated) -> dict[str, Any]:
     """Returns what the command says of a recording. Raises InputError where it is no recording of a test."""
     recording = reading.recording
     phases = segment(recording)
