@@ -126,6 +126,30 @@ def test_the_series_is_read_back_with_its_times_displacements_and_pressures(prob
     np.testing.assert_allclose((effective - total)[:, 0, 1], 0.0, atol=1e-9)
 
 
+def test_paraview_s_reader_reads_the_series(problem, tmp_path):
+    """VTK contains the XDMF reader of ParaView."""
+    vtk = pytest.importorskip("vtk", reason="VTK is not installed: pip install vtk")
+    numpy_support = pytest.importorskip("vtk.util.numpy_support")
+    writer = FieldWriter(tmp_path, problem, THETA)
+    gradient = np.array([[0.1, 0, 0.02], [0, -0.03, 0], [0, 0, -0.04]])
+    for time_s in (0.0, 1.0, 2.5):
+        writer.on_state(time_s, stretched(problem, time_s * gradient, 1e4 * time_s), 0.0)
+    reader = vtk.vtkXdmfReader()
+    reader.SetFileName(str(writer.write()[0]))
+    reader.UpdateInformation()
+    key = vtk.vtkStreamingDemandDrivenPipeline.TIME_STEPS()
+    assert reader.GetOutputInformation(0).Get(key) == (0.0, 1.0, 2.5)
+    reader.UpdateTimeStep(2.5)
+    grid = reader.GetOutput().GetBlock(0)
+    points = numpy_support.vtk_to_numpy(grid.GetPoints().GetData())
+    of_points, of_cells = grid.GetPointData(), grid.GetCellData()
+    displacement = numpy_support.vtk_to_numpy(of_points.GetArray("displacement"))
+    np.testing.assert_allclose(displacement, 2.5 * points @ gradient.T, atol=1e-9)
+    np.testing.assert_allclose(numpy_support.vtk_to_numpy(of_points.GetArray("pressure")), 2.5e4, rtol=1e-6)
+    cutis = numpy_support.vtk_to_numpy(of_cells.GetArray("cutis"))
+    np.testing.assert_array_equal(cutis.astype(bool), problem.mesh.cutis)
+
+
 def test_bricks_of_the_series_are_not_turned_inside_out_in_vtk_order(problem, tmp_path):
     writer = FieldWriter(tmp_path, problem, THETA)
     writer.on_state(0.0, np.zeros(problem.space.dofs), 0.0)
