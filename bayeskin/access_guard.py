@@ -54,7 +54,7 @@ def apply_inherited_guards() -> None:
 @cache
 def _set_hook() -> None:
     """Installs the audit hook once per process."""
-    sys.addaudithook(_refuse)  # for the life of the process: Python cannot remove an audit hook
+    sys.addaudithook(_refuse)  # Python cannot remove an audit hook, so it stays for the life of the process
 
 
 def _refuse(event: str, arguments: tuple[Any, ...]) -> None:

@@ -208,7 +208,11 @@ def sobol_unit(dim: int, n: int, seed: int | Sequence[int], skip: int = 0) -> Ar
     from scipy.stats import qmc  # the import takes a second, which worker processes save
 
     if n < 0 or skip < 0 or np.min(seed) < 0:
-        raise InputError("Sobol' points", f"n = {n}, skip = {skip}, seed = {seed}", "values of at least 0")
+        raise InputError(
+            "Sobol' points",
+            f"n = {n}, skip = {skip} and seed = {seed} are given",
+            "none of them can be negative",
+        )
     engine = qmc.Sobol(dim, scramble=True, seed=np.random.default_rng(seed))
     if skip:
         return engine.fast_forward(skip).random(n)

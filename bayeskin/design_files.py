@@ -24,9 +24,15 @@ def load_design(path: Path | str) -> Design:
     }  # fmt: skip
     for name, shape in shapes.items():
         if getattr(design, name).shape != shape:
-            raise InputError(f"{path}: {name}", f"shape {getattr(design, name).shape}", f"shape {shape}")
+            raise InputError(
+                f"{path}: {name}", f"its shape is {getattr(design, name).shape}", f"it must be {shape}"
+            )
     if len(design.messages) != rows:
-        raise InputError(f"{path}: messages", f"{len(design.messages)} messages", f"{rows}, one for each row")
+        raise InputError(
+            f"{path}: messages",
+            f"the number of messages is {len(design.messages)}",
+            f"it must be {rows}, one for each row",
+        )
     if not (np.isfinite(design.theta).all() and np.isfinite(design.force_n[design.ok]).all()):
-        raise InputError(path, "values that are not finite", "finite values, except in runs that failed")
+        raise InputError(path, "some values are not finite", "only the forces of failed runs can be so")
     return design

@@ -77,18 +77,24 @@ class Geometry:
             if value is not None:
                 _check_length(name, value, bounds)
         if self.guard is not None and self.guard.width_m <= self.guard.gap_m:
-            found = f"{_in_mm(self.guard.width_m)} with a gap of {_in_mm(self.guard.gap_m)}"
+            problem = f"it is {_in_mm(self.guard.width_m)} with a gap of {_in_mm(self.guard.gap_m)}"
             raise InputError(
-                "guard.width_m", found, "a width above the gap, because beside the pad it includes the gap"
+                "guard.width_m",
+                problem,
+                "it must be above the gap, because beside the pad it includes the gap",
             )
         if self.force_on not in ("pad", "pad and guard"):
-            raise InputError("force_on", repr(self.force_on), "'pad' or 'pad and guard'")
+            raise InputError("force_on", f"{self.force_on!r} is not known", "use 'pad' or 'pad and guard'")
         if self.force_on == "pad and guard" and self.guard is None:
-            raise InputError("force_on", "'pad and guard' without a guard", "'pad', or a device with a guard")
+            raise InputError(
+                "force_on",
+                "'pad and guard' needs a guard, and this device has none",
+                "use 'pad', or a device with a guard",
+            )
         if self.arm_radius_m is not None and self.box_m[1] > math.pi * self.arm_radius_m:
             least = _in_mm(self.least_radius_m)
-            expected = f"at least {least}, so that the modelled skin does not overlap itself"
-            raise InputError("arm_radius_m", _in_mm(self.arm_radius_m), expected)
+            remedy = f"it must be at least {least}, so that the modelled skin does not overlap itself"
+            raise InputError("arm_radius_m", f"it is {_in_mm(self.arm_radius_m)}", remedy)
 
     def _value(self, name: str) -> float | None:
         """Returns the length with a name of `BOUNDS_MM`; None where there is no guard or the skin is flat."""
@@ -180,11 +186,13 @@ def _check_length(name: str, length_m: float, bounds_mm: tuple[float, float]) ->
     low, high = bounds_mm
     if low <= round(1e3 * length_m, 12) <= high:
         return
-    found, expected = _in_mm(length_m), f"{low:g} to {high:g} mm"
+    problem = f"it is {_in_mm(length_m)}"
     if length_m <= 0.0:
-        reasons = {"gauge_m": ": the pads overlap", "guard.gap_m": ": the guard lies inside the pad"}
-        raise InputError(name, found + reasons.get(name, ""), f"above zero, {expected}")
+        reasons = {"gauge_m": ", so the pads overlap", "guard.gap_m": ", so the guard lies inside the pad"}
+        raise InputError(
+            name, problem + reasons.get(name, ""), f"it must be above zero, {low:g} to {high:g} mm"
+        )
     for factor, text in ((1e-3, "1000 times too large"), (1e3, "1000 times too small")):
         if low <= factor * 1e3 * length_m <= high:
-            found += f", probably {text} (is the unit right?)"
-    raise InputError(name, found, expected)
+            problem += f", probably {text} (is the unit right?)"
+    raise InputError(name, problem, f"it must be {low:g} to {high:g} mm")

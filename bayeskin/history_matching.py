@@ -25,7 +25,7 @@ class MatchingSettings:
 
     surrogate_sds : number of sd of the surrogate beyond which its error is ruled out; 3 sd contain at least
         95 % of any unimodal error (Pukelsheim 1994)
-    enough : number of survivors from which on the kept fraction is known to about 6 %, and the bounding box
+    enough : number of survivors with which the kept fraction is known to about 6 %, and the bounding box
         to about 1 % of its width
     first_candidates, most_candidates : number of candidates of the first round, and largest number of a round
     rounds : largest number of rounds
@@ -57,7 +57,7 @@ def misfit_bounds(mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike
     weight = np.asarray(weights, dtype=float)
     used = weight > 0
     if not used.any():
-        raise InputError("weights of the bins", "no bin with a weight above zero", "at least one fitted bin")
+        raise InputError("weights of the bins", "no weight is above zero", "at least one bin must be fitted")
     share = weight[used] / weight[used].sum()
     misfit = np.sqrt((np.asarray(force_n)[used] - mean[:, used]) ** 2 @ share)
     spread = np.sqrt(sd[:, used] ** 2 @ share)

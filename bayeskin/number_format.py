@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LONGEST, _SMALLEST = 5, -4  # numbers between these powers of ten are written out
-_FAR = 100.0  # from this ratio of an interval's ends on, each end may have its own unit
+_FAR = 100.0  # smallest ratio of an interval's ends at which each end may have its own unit
 # A value of at least `size` is printed in the unit `name`, the largest first: (size in SI, factor, name).
 _SCALES = {
     "Pa": ((1e6, 1e-6, "MPa"), (1e3, 1e-3, "kPa"), (0.0, 1.0, "Pa")),
@@ -83,7 +83,7 @@ def with_interval(value: float, low: float, high: float, unit: str = "", digits:
     factor, name = scale([value, low, high], unit)
     power = math.floor(math.log10(abs(factor * value))) if value else 0
     power = 0 if _SMALLEST <= power < _LONGEST else power
-    middle, *ends = (number(factor * one / 10.0**power, digits) for one in (value, low, high))
+    middle, *ends = (number(factor * bound / 10.0**power, digits) for bound in (value, low, high))
     times = f"× 10{str(power).translate(_RAISED)}" if power else ""
     return " ".join(part for part in (f"{middle} [{ends[0]}, {ends[1]}]", times, name) if part)
 

@@ -15,7 +15,7 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 
 # A busy machine takes seconds to start Python. It reads 100 times as fast as assumed here.
 STARTS_S, BYTES_A_S = 60.0, 2e6
@@ -45,14 +45,21 @@ def refuse_endless(path: Path, expected: str, most_bytes: int = MOST_BYTES) -> N
     try:
         status = os.stat(path)
     except FileNotFoundError:
-        raise InputError(path, "no such file", expected) from None
+        raise InputError(path, "there is no such file", f"bayeskin needs {expected}") from None
     except (OSError, ValueError) as error:
-        raise InputError(path, f"an unreadable file ({error})", expected) from None
+        raise InputError(
+            path, f"it cannot be read ({reason_of(error)})", f"bayeskin needs {expected}"
+        ) from None
     if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device instead of a file"
-        raise InputError(path, kind, expected)
+        folder = stat.S_ISDIR(status.st_mode)
+        problem = "it is a folder" if folder else "it is a pipe or a device instead of a file"
+        raise InputError(path, problem, f"bayeskin needs {expected}")
     if status.st_size > most_bytes:
-        raise InputError(path, f"{status.st_size} bytes", f"{expected}, of at most {most_bytes} bytes")
+        raise InputError(
+            path,
+            f"it has {status.st_size} bytes",
+            f"bayeskin needs {expected}, of at most {most_bytes} bytes",
+        )
 
 
 def bytes_of(path: Path, expected: str, most_bytes: int = MOST_BYTES) -> bytes:
@@ -61,7 +68,9 @@ def bytes_of(path: Path, expected: str, most_bytes: int = MOST_BYTES) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(path, f"an unreadable file ({error.strerror})", expected) from None
+        raise InputError(
+            path, f"it cannot be read ({reason_of(error)})", f"bayeskin needs {expected}"
+        ) from None
 
 
 def refuse_damaged(path: Path, expected: str) -> None:
@@ -70,7 +79,7 @@ def refuse_damaged(path: Path, expected: str) -> None:
     status = os.stat(path)
     fault = _fault_of(str(path), status.st_size, status.st_mtime_ns, status.st_ino)
     if fault is not None:
-        raise InputError(path, fault, expected)
+        raise InputError(path, fault, f"bayeskin needs {expected}")
 
 
 @lru_cache(maxsize=64)
@@ -85,8 +94,8 @@ def _fault_of(path: str, size: int, *_version: int) -> str | None:
             command, capture_output=True, text=True, timeout=STARTS_S + size / BYTES_A_S, check=False
         )
     except subprocess.TimeoutExpired:
-        return "a file that is not readable as HDF5 (reading it does not end)"
+        return "it cannot be read as HDF5 (reading it does not end)"
     if reader.returncode == 0:
         return None
     why = " ".join(reader.stderr.split())[-120:] if reader.returncode == 1 else "reading it ends the process"
-    return f"a file that is not readable as HDF5 ({why})"
+    return f"it cannot be read as HDF5 ({why})"

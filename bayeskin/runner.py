@@ -128,7 +128,7 @@ def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, thet
         elif not message:
             message = "the run failed without a message"
     except Unavailable as error:
-        unavailable = (error.where, error.found, error.expected)
+        unavailable = (error.where, error.problem, error.remedy)
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - start
@@ -163,7 +163,11 @@ def _checked_run(store: Store, outcome: _Outcome | Lost, bins: int, model_hash: 
     if outcome.unavailable is not None:
         raise Unavailable(*outcome.unavailable)
     if outcome.model_hash not in ("", model_hash):
-        raise InputError(store.path, f"a run of model {outcome.model_hash}", f"runs of model {model_hash}")
+        raise InputError(
+            store.path,
+            f"a run comes from the model {outcome.model_hash}",
+            f"all its runs must come from the model {model_hash}",
+        )
     return outcome.run
 
 
@@ -174,12 +178,16 @@ def _distinct(wave: Wave) -> dict[bytes, Array]:
     """
     theta = wave.theta
     if theta.ndim != 2 or theta.shape[1] != wave.space.dim or len(theta) != len(wave.held_out):
-        raise InputError("points of a design", f"shape {theta.shape}", f"shape (n, {wave.space.dim})")
+        raise InputError(
+            "points of a design", f"the shape is {theta.shape}", f"it must be (n, {wave.space.dim})"
+        )
     outside = np.flatnonzero(~wave.space.contains(theta))
     if len(outside):
         row = outside[0]
         raise InputError(
-            f"points of a design: row {row}", theta[row].tolist(), "a point inside the prior box"
+            f"points of a design: row {row}",
+            f"the point is {theta[row].tolist()}",
+            "it must lie inside the box of the priors",
         )
     return {row.tobytes(): row for row in theta}
 

@@ -78,8 +78,11 @@ def simulate(
         space = parameter_space(run.config)
         unknown = set(theta or {}) - set(space.names)
         if unknown:
-            found = ", ".join(sorted(unknown))
-            raise InputError("simulate: theta", found, f"some of {', '.join(space.names)}")
+            raise InputError(
+                "simulate: theta",
+                f"{min(unknown)} is not known",
+                f"use some of {', '.join(space.names)}",
+            )
         middle = dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
         spec, protocol = model_spec(run), run.config.each_recording[0].protocol
         motion = pad_motion(spec, recording, segment(recording), protocol)
@@ -134,15 +137,15 @@ def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24)
     run` makes such posteriors where it trains the surrogate further.
     """
     if draws < FEWEST_CHECKED:
-        raise InputError("draws", draws, f"at least {FEWEST_CHECKED}")
+        raise InputError("draws", f"{draws} draws are too few", f"use at least {FEWEST_CHECKED}")
     settings = _settings_of(recording, posterior)
     with _run_on(recording, settings) as run:
         inputs = _calibration_inputs(run, recording)
         log_posterior, flat = inputs.log_posterior, inference.draws_of(posterior)[1]
         if json.loads(posterior.attrs["provenance"]).get("identity") != log_posterior.identity:
-            found = f"a posterior by another surrogate than that of {run.config.surrogate.file}"
+            problem = f"it was made with another surrogate than {run.config.surrogate.file}"
             raise InputError(
-                "posterior", found, "a posterior of bk.calibrate (`bayeskin run` checks its own)"
+                "posterior", problem, "use a posterior of bk.calibrate (`bayeskin run` checks its own)"
             )
         chosen = inference.evenly(flat, draws)
         spec, names, edges = model_spec(run), log_posterior.surrogate.space.names, inputs.binned.edges_s
@@ -216,8 +219,8 @@ def _with_surrogate(
         fitting = shipped_for(idealised_motion(recording, segment(recording)))
         if fitting is None:
             raise InputError(
-                f"calibrate {recording.name}", "a protocol that no shipped surrogate was trained on",
-                "surrogate=FILE from `bayeskin train`, or `bayeskin run` with a configuration",
+                f"calibrate {recording.name}", "no shipped surrogate was trained on its protocol",
+                "give surrogate=FILE from `bayeskin train`, or use `bayeskin run` with a configuration",
             )  # fmt: skip
         surrogate = fitting.name
     file = Path(surrogate)
@@ -232,18 +235,18 @@ def _settings_of(recording: Recording, posterior: arviz.InferenceData) -> dict[s
     recording = _checked_recording(recording)
     if "recording_sha256" not in posterior.attrs:
         raise InputError(
-            "posterior", "an InferenceData without provenance", "an InferenceData that bayeskin made"
+            "posterior", "this InferenceData has no provenance", "use InferenceData that bayeskin made"
         )
     if posterior.attrs["recording_sha256"] != recording.sha256:
         raise InputError(
             "posterior",
-            f"the posterior of another recording than {recording.name}",
-            "the recording of this posterior",
+            f"it belongs to another recording than {recording.name}",
+            "use the recording of this posterior",
         )
     settings = dict(json.loads(posterior.attrs["provenance"])["config"])
     if settings["surrogate"].get("file") is None:
-        expected = "the posterior of a surrogate file (otherwise use `bayeskin run` or `bayeskin diagnose`)"
-        raise InputError("posterior", "the posterior of a run with its own design", expected)
+        remedy = "use the posterior of a surrogate file, or `bayeskin run` or `bayeskin diagnose`"
+        raise InputError("posterior", "it belongs to a run with its own design", remedy)
     return settings
 
 
@@ -251,7 +254,9 @@ def _checked_recording(given: object) -> Recording:
     """Returns the recording. Raises InputError for an object of another type."""
     if not isinstance(given, Recording):
         raise InputError(
-            "recording", f"{type(given).__name__} {given!r:.60}", "a recording of bk.load_recording"
+            "recording",
+            f"{given!r:.60} has the type {type(given).__name__}",
+            "use a recording of bk.load_recording",
         )
     return given
 

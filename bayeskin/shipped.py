@@ -18,6 +18,4 @@ def shipped(name: str) -> Path:
     for root in _ROOTS:
         if (root / name).is_file():
             return root / name
-    raise InputError(
-        name, "no such file among those shipped with bayeskin", "a complete installation (reinstall bayeskin)"
-    )
+    raise InputError(name, "it is not among the files that come with bayeskin", "install bayeskin again")

@@ -81,10 +81,10 @@ def load(path: Path | str, cls: type[T]) -> T:
 
     Raises InputError if the file is absent, is not HDF5, is not a file of bayeskin, or holds another type.
     """
-    path, expected = Path(path), f"a bayeskin {cls.__name__} file"
+    path, expected = Path(path), f"a {cls.__name__} in its own HDF5 form"
     with reading(path, expected) as handle:
         if handle.attrs.get("format") != FORMAT:
-            raise InputError(path, "an HDF5 file of another origin", expected)
+            raise InputError(path, "it is an HDF5 file of another origin", f"bayeskin needs {expected}")
         return read(handle, cls, path)
 
 
@@ -95,21 +95,17 @@ def reading(path: Path, expected: str) -> Iterator[h5py.File]:
     All errors inside the context are taken as errors in this file: each becomes an InputError that names it.
     """
     if not path.is_file():
-        raise InputError(path, "no such file", expected)
+        raise InputError(path, "there is no such file", f"bayeskin needs {expected}")
     try:
         with h5py.File(path, "r") as handle:
             yield handle
     except InputError as error:
         if error.where.startswith(str(path)):
             raise
-        raise InputError(f"{path}: {error.where}", error.found, error.expected) from None
+        raise InputError(f"{path}: {error.where}", error.problem, error.remedy) from None
     except Exception as error:  # libhdf5, json and numpy raise many types of error for a damaged file
-        fault = (
-            "a file that is not readable as HDF5"
-            if isinstance(error, OSError)
-            else "contents that cannot be read"
-        )
-        raise InputError(path, f"{fault} ({in_a_line(error)})", expected) from None
+        problem = "it cannot be read as HDF5" if isinstance(error, OSError) else "its contents cannot be read"
+        raise InputError(path, f"{problem} ({in_a_line(error)})", f"bayeskin needs {expected}") from None
 
 
 def in_a_line(error: Exception) -> str:
@@ -132,13 +128,17 @@ def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
     """
     stored_type = group.attrs.get("type")
     if stored_type != cls.__name__:
-        raise InputError(where or group.name, f"type {stored_type!r}", f"type {cls.__name__!r}")
+        raise InputError(where or group.name, f"its type is {stored_type!r}", f"it must be {cls.__name__!r}")
     values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in group and field.name not in group.attrs:
             if field.default is not dataclasses.MISSING:
                 continue
-            raise InputError(where or group.name, f"no field {field.name!r}", f"all fields of {cls.__name__}")
+            raise InputError(
+                where or group.name,
+                f"it has no field {field.name!r}",
+                f"it needs all fields of {cls.__name__}",
+            )
         values[field.name] = _read_field(group, field.name)
     return checked(cls(**values), where or group.name)
 
@@ -152,11 +152,12 @@ def checked(value: T, where: object) -> T:
     for field in dataclasses.fields(value):  # type: ignore[arg-type]
         given = getattr(value, field.name)
         if not _is(given, kinds[field.name]):
-            found, expected = (
-                " ".join(repr(given).split())[:60],
-                f"{field.type}, as a {type(value).__name__} requires",
+            value_text = " ".join(repr(given).split())[:60]
+            raise InputError(
+                f"{where}: {field.name}",
+                f"its value is {value_text}",
+                f"it must be {field.type}, as a {type(value).__name__} needs it",
             )
-            raise InputError(f"{where}: {field.name}", found, expected)
     return value
 
 
@@ -222,7 +223,7 @@ def _read_dataclass(group: h5py.Group, name: str) -> Any:
     """Reads a dataclass whose type the group itself states. Raises InputError for an unknown type."""
     stored_type = group.attrs.get("type")
     if stored_type not in _STORED:
-        raise InputError(group.name, f"type {stored_type!r}", "a type that bayeskin stores")
+        raise InputError(group.name, f"its type is {stored_type!r}", "it must be a type that bayeskin stores")
     return read(group, _STORED[stored_type], name)
 
 

@@ -43,7 +43,7 @@ from bayeskin.hashing import sha256_of
 
 T = TypeVar("T")
 FORMAT = b"bayeskin store 1"
-REMEDY = "a store of finished results that this command wrote (without this file, the work starts again)"
+REMEDY = "bayeskin needs a store that this command wrote (delete this file to start the work again)"
 
 
 class Store:
@@ -114,7 +114,9 @@ class Store:
         except (AttributeError, TypeError, ValueError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"{self.path}, byte {start}", f"no {kind.__name__} in a line", REMEDY) from None
+            raise InputError(
+                f"{self.path}, byte {start}", f"this line does not describe a {kind.__name__}", REMEDY
+            ) from None
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
@@ -177,8 +179,10 @@ class Store:
         first = lines.readline(len(self._header))
         if not self._header.startswith(first):
             known = first.startswith(FORMAT + b" ")
-            found = "results that were computed from other inputs" if known else "other contents"
-            raise InputError(self.path, found, REMEDY)
+            problem = (
+                "its results were computed from other inputs" if known else "it is not a store of results"
+            )
+            raise InputError(self.path, problem, REMEDY)
         return len(first) if first == self._header else 0
 
 

@@ -27,7 +27,7 @@ from bayeskin.types import PadMotion, Simulation
 REFERENCE = 2
 SKINS = ("A", "C")
 CORNERS_S = (0.0, 9.4, 20.0, 29.4)
-EXTENSION = 9.45e-3 / Geometry().gauge_m  # as a share of the gauge, as in the healthy-skin recording
+EXTENSION = 9.45e-3 / Geometry().gauge_m  # stretch of the gauge in the healthy-skin recording
 PAGE = Path(__file__).parents[1] / "docs" / "discretisation.md"
 GEOMETRIES = {
     "the article's": Geometry(),

@@ -15,7 +15,7 @@ from bayeskin.types import Simulation
 SPACE_TOLERANCE = 3e-4
 SPACE_REFERENCE = "bricks-3"
 LOADING = "first loading"
-TimeErrors = Mapping[tuple[float, str], "Error"]  # by (tolerance, point)
+TimeErrors = Mapping[tuple[float, str], "Error"]  # keys: tolerance and point
 
 
 @dataclass(frozen=True)

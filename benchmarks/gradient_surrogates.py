@@ -54,7 +54,7 @@ CHAOS = ChaosSettings()
 STEERED = ("E_s", "k_c", "k_s", "p_init")  # the force is differentiated by one parameter for each input
 P_INIT_CHANGE_PA = 100.0
 SLOPE_WEIGHTS = (0.03, 0.1, 0.3)  # weight of a derivative over the box's width, relative to a value
-STEP = 0.003  # from a run to a predicted row, over the box's width; the best of 0.001 to 0.06
+STEP = 0.003  # distance from a run to a predicted row, over the box's width; the best of 0.001 to 0.06
 KINDS = ("chaos", "GP", "chaos with derivatives", "GP with derivatives")
 COLOURS = ("#E69F00", "#0072B2", "#D55E00", "#009E73")
 

@@ -10,7 +10,7 @@ the same bins: where spikes are left in the bins, the phase that is left out is 
     python benchmarks/noise_models.py                                            # the demo
     python benchmarks/noise_models.py --recording FILE.h5 --surrogate FILE.h5    # another recording
 
-The program prints the table. For the demo it also writes it between its markers of docs/inference.md.
+The program prints the table. For the demo it also writes it between its markers of docs/calibration.md.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import Array, BinnedForce
 
-DOCS = Path(__file__).parents[1] / "docs" / "inference.md"
+DOCS = Path(__file__).parents[1] / "docs" / "calibration.md"
 SETTINGS = SampleSettings(2, 40, 8000, Limits(effective_samples=1000.0))
 SHIPPED = "as shipped"
 GOOD_K = 0.7  # a score with a larger Pareto k is not reliable

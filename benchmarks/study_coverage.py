@@ -167,8 +167,8 @@ def infer(inputs: Mapping[str, Any], settings: SamplerSettings = SETTINGS) -> di
     return {
         **inputs, **_compared(truth, population), "trusted": population.trusted,
         "sweeps": population.convergence.steps,
-        "contradictions": sum(one.contradicts for one in population.overlaps),
-        "poor overlaps": sum(one.poor for one in population.overlaps),
+        "contradictions": sum(overlap.contradicts for overlap in population.overlaps),
+        "poor overlaps": sum(overlap.poor for overlap in population.overlaps),
         "cpu_s": time.process_time() - started,
     }  # fmt: skip
 
@@ -176,13 +176,13 @@ def infer(inputs: Mapping[str, Any], settings: SamplerSettings = SETTINGS) -> di
 def _compared(truth: Truth, population: Population) -> dict[str, float]:
     """Returns true values with estimates, and how well the recordings' values are known alone and shrunk."""
     out: dict[str, float] = {}
-    for j, one in enumerate(population.parameters):
-        name = one.parameter.name
-        assert one.within is not None
+    for j, summary in enumerate(population.parameters):
+        name = summary.parameter.name
+        assert summary.within is not None
         pairs = (
-            *zip(np.exp(truth.medians[:, j]), (one.medians[group] for group in GROUPS), strict=True),
-            (np.exp(truth.medians[1, j] - truth.medians[0, j]), one.contrasts[0].ratio),
-            (truth.between[j], one.between.sd), (truth.within[j], one.within.sd),
+            *zip(np.exp(truth.medians[:, j]), (summary.medians[group] for group in GROUPS), strict=True),
+            (np.exp(truth.medians[1, j] - truth.medians[0, j]), summary.contrasts[0].ratio),
+            (truth.between[j], summary.between.sd), (truth.within[j], summary.within.sd),
         )  # fmt: skip
         for quantity, (true, estimate) in zip(QUANTITIES, pairs, strict=True):
             ends = (float(true), estimate.low, estimate.median, estimate.high)
@@ -202,19 +202,21 @@ def _contains(estimate: Estimate, value: float) -> bool:
     return bool(estimate.low <= value <= estimate.high)
 
 
-def inside(found: Sequence[Mapping[str, str]], name: str, quantity: str) -> NDArray[np.bool_]:
+def inside(results: Sequence[Mapping[str, str]], name: str, quantity: str) -> NDArray[np.bool_]:
     """Returns for each study whether the 90 % interval contains the true value, (n,)."""
-    true, low, _, high = (np.array([float(row[f"{name} {quantity} {end}"]) for row in found]) for end in ENDS)
+    true, low, _, high = (
+        np.array([float(row[f"{name} {quantity} {end}"]) for row in results]) for end in ENDS
+    )
     return (low <= true) & (true <= high)
 
 
-def coverage_table(found: Sequence[Mapping[str, str]]) -> str:
+def coverage_table(results: Sequence[Mapping[str, str]]) -> str:
     """Returns the shares of studies whose 90 % intervals contain the true values."""
     lines = []
     for name in SPACE.names:
-        shares = [inside(found, name, quantity).mean() for quantity in QUANTITIES]
+        shares = [inside(results, name, quantity).mean() for quantity in QUANTITIES]
         lines.append([name, *(f"{100 * share:.0f} %" for share in shares)])
-    each = [np.mean([inside(found, name, quantity) for name in SPACE.names]) for quantity in QUANTITIES]
+    each = [np.mean([inside(results, name, quantity) for name in SPACE.names]) for quantity in QUANTITIES]
     lines.append(["all", *(f"{100 * share:.1f} %" for share in each)])
     header = (
         "", "median, first group", "median, second group", "ratio of the groups", "spread between subjects",
@@ -223,11 +225,11 @@ def coverage_table(found: Sequence[Mapping[str, str]]) -> str:
     return rows.markdown(header, lines)
 
 
-def shrinkage_table(found: Sequence[Mapping[str, str]]) -> str:
+def shrinkage_table(results: Sequence[Mapping[str, str]]) -> str:
     """Returns how far single recordings' medians are off, and how often their intervals are right."""
 
     def mean(column: str) -> float:
-        return float(np.mean([float(row[column]) for row in found]))
+        return float(np.mean([float(row[column]) for row in results]))
 
     lines = [
         [
@@ -252,17 +254,17 @@ def main() -> None:
     folder = Path(bayeskin.study.__file__).parent
     sources = rows.code_digest(folder / f"{name}.py" for name in NUMERICAL)
     inputs = {"sources": sources, "seed": options.seed}
-    found = []
+    results = []
     for index in range(options.n):
         row = store.find(**inputs, index=index)
         if row is None:
             row = store.append(**infer({**inputs, "index": index}))
             rows.say(f"{index + 1} of {options.n}: {float(row['cpu_s']):.0f} CPU s, {row['sweeps']} sweeps")
-        found.append(row)
-    trusted = sum(row["trusted"] == "True" for row in found)
-    seconds = np.median([float(row["cpu_s"]) for row in found])
-    rows.say(f"{trusted} of {len(found)} studies are trusted; {seconds:.0f} CPU s a study (median)")
-    for name, table in (("coverage", coverage_table(found)), ("shrinkage", shrinkage_table(found))):
+        results.append(row)
+    trusted = sum(row["trusted"] == "True" for row in results)
+    seconds = np.median([float(row["cpu_s"]) for row in results])
+    rows.say(f"{trusted} of {len(results)} studies are trusted; {seconds:.0f} CPU s a study (median)")
+    for name, table in (("coverage", coverage_table(results)), ("shrinkage", shrinkage_table(results))):
         print(f"{table}\n")
         if options.results == rows.RESULTS:
             rows.into_docs(DOCS, name, table)

@@ -23,7 +23,7 @@ from bayeskin.types import PadMotion
 from bayeskin.workflow.folder import read_record
 from bayeskin.workflow.study import study
 
-GROUPS, FACTOR, SPREAD = ("control", "keloid"), 1.8, 0.25  # of E_c; sd of the logarithms between subjects
+GROUPS, FACTOR, SPREAD = ("control", "keloid"), 1.8, 0.25  # factor and sd of log(E_c)
 MOTION = PadMotion(
     np.array([0.0, 5.0, 11.0, 51.0, 57.0, 77.0]), 1e-3 * np.array([0.0, 0.0, 6.0, 6.0, 0.0, 0.0])
 )

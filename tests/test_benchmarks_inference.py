@@ -93,15 +93,15 @@ def test_only_the_phase_left_out_is_scored_on_the_other_force(benchmark):
 
 def test_each_model_of_the_noise_lacks_one_part(benchmark):
     noise = benchmark("noise_models")
-    found = noise.models(shipped("data/demo.h5"), shipped("surrogates/demo.h5"))
-    reference = found[noise.SHIPPED]
+    models = noise.models(shipped("data/demo.h5"), shipped("surrogates/demo.h5"))
+    reference = models[noise.SHIPPED]
     assert reference.noise_priors == NoisePriors()
-    assert found["Gaussian"].space.lower[-1] >= 1e5
-    assert found["white"].noise_priors.tau_s[1] < 0.01 * np.diff(reference.binned.edges_s).min()
-    one_sd = found["one sd for all phases"]
+    assert models["Gaussian"].space.lower[-1] >= 1e5
+    assert models["white"].noise_priors.tau_s[1] < 0.01 * np.diff(reference.binned.edges_s).min()
+    one_sd = models["one sd for all phases"]
     assert [name for name in one_sd.names if name.startswith("sd_")] == ["sd_hold"]
     assert len(one_sd.blocks) == len(reference.blocks)
-    spiked = found["spikes left in the bins"].binned
+    spiked = models["spikes left in the bins"].binned
     recording = read_recording(shipped("data/demo.h5"))
     integral = cumulative_trapezoid(recording.force_n, recording.time_s, initial=0)
     plain = np.interp(spiked.edges_s, recording.time_s, integral)

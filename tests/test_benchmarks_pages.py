@@ -44,7 +44,7 @@ def test_stored_ranks_are_uniform_and_stand_in_the_documentation(benchmark, data
 
 def shown(table: str) -> bool:
     """Returns whether a page of the documentation has the rows of a table."""
-    page = (Path(__file__).parents[1] / "docs" / "inference.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "calibration.md").read_text()
     return all(line in page for line in table.splitlines()[2:])
 
 
@@ -101,17 +101,17 @@ def test_the_page_of_the_proof_counts_all_sets_and_leaves_out_what_is_not_judged
 def test_the_skins_parameters_are_counted_by_what_was_concealed(benchmark):
     page = benchmark("proof_page")
 
-    def one(number, kind, label, named, right, size, hits):
+    def verdict(number, kind, label, named, right, size, hits):
         inside = dict(zip(("E_c", "E_s"), hits, strict=True))
         answer = " + ".join(named) or "nothing-missing"
         return {"number": number, "kind": kind, "label": label, "named": named, "answer": answer,
                 "right": right, "size": size, "inside_base": inside}  # fmt: skip
 
     each = [
-        one("1", "nothing", "nothing", [], False, 0.0, (True, True)),
-        one("2", "alone", "pad-slip", ["pad-slip"], True, 5.0, (True, False)),
-        one("3", "alone", "pre-stretch", [], False, 1.0, (False, False)),
-        one("4", "outside", "peeling", ["pad-slip"], False, 2.0, (False, True)),
+        verdict("1", "nothing", "nothing", [], False, 0.0, (True, True)),
+        verdict("2", "alone", "pad-slip", ["pad-slip"], True, 5.0, (True, False)),
+        verdict("3", "alone", "pre-stretch", [], False, 1.0, (False, False)),
+        verdict("4", "outside", "peeling", ["pad-slip"], False, 2.0, (False, True)),
     ]
     cells = {
         line.split(" | ")[0].strip("| "): [cell.strip(" |") for cell in line.split(" | ")[1:]]

@@ -26,7 +26,7 @@ def test_intervals_of_few_studies_contain_their_true_values(benchmark, monkeypat
         study.infer({"sources": "", "seed": 2, "index": n}, SamplerSettings(max_sweeps=200)) for n in range(2)
     ]
     assert set(rows[0]) == set(study.ROWS.columns)
-    found = [
+    inside = [
         [
             study.inside([row], name, quantity)[0]
             for name in study.SPACE.names
@@ -34,7 +34,7 @@ def test_intervals_of_few_studies_contain_their_true_values(benchmark, monkeypat
         ]
         for row in rows
     ]
-    assert 31 <= np.sum(found) <= 40
+    assert 31 <= np.sum(inside) <= 40
     assert not any(row["contradictions"] for row in rows)
     shrunk, alone = (np.mean([row[f"{n} error {w}"] for row in rows for n in study.SPACE.names])
                      for w in ("shrunk", "alone"))  # fmt: skip

@@ -110,9 +110,9 @@ def test_a_reader_that_leaves_early_does_not_hide_what_was_found(monkeypatch: py
 def test_every_stage_refuses_a_wrong_configuration(bayeskin: Command, tmp_path: Path, command: str) -> None:
     path = tmp_path / "case.toml"
     path.write_text('[recording]\nfile = "r.csv"\ncolour = 3\n')
-    assert_refused(bayeskin(command, path), "case.toml: recording.colour", "unknown key")
+    assert_refused(bayeskin(command, path), "case.toml: recording.colour", "this key is not known")
     path.write_text('[recording]\nfile = "r.csv"\n[parameters.k_c]\nlower = 1e-11\nupper = 1e-16\n')
-    assert_refused(bayeskin(command, path), "case.toml: parameters.k_c", "lower below upper")
+    assert_refused(bayeskin(command, path), "case.toml: parameters.k_c", "the lower bound")
     path.write_text('[recording]\nfile = "r.csv"\n')
     assert_refused(bayeskin(command, path), "case.toml", "r.csv")
     assert_refused(bayeskin(command, tmp_path / "absent.toml"), "no such file")
@@ -154,10 +154,10 @@ def ready(measured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("extra", "says"),
     [
-        ("[parameters.E_c]\nupper = 4e6\n", "bounds within 10000 to 2e+06"),
+        ("[parameters.E_c]\nupper = 4e6\n", "it must lie within 10000 to 2e+06"),
         ("[fit]\nbin_width_s = 1.0\n", "130 bins"),
         ("[model]\nrefinement = 2\n", "another model"),
-        ("[surrogate]\nfile = 'absent.h5'\n", "a shipped file: demo.h5"),
+        ("[surrogate]\nfile = 'absent.h5'\n", "a shipped one: demo.h5"),
     ],
     ids=["parameters outside its box", "other bins", "other model", "absent"],
 )
@@ -251,7 +251,7 @@ def test_the_command_line_starts_without_the_packages_of_the_computation() -> No
 def test_a_set_of_what_nobody_knows_is_refused(tmp_path: Path, bayeskin: Command) -> None:
     code, _, said = bayeskin("conceal", tmp_path / "set", "--seed", 1, "--count", 2, "--only", "pad-slop")
     assert code == 2
-    assert "--only: found pad-slop; expected nothing, or one of backlash" in said
+    assert "--only: pad-slop is not known; use one of nothing, backlash" in said
     assert not (tmp_path / "set" / "index.json").exists()
 
 

@@ -66,14 +66,17 @@ def test_simulate_takes_a_device_and_the_means_of_an_uncertain_tissue(
 @pytest.mark.parametrize(
     ("device", "says"),
     [
-        ("[device]\ngauge_mm = 0\n", "device.gauge_mm: found 0 mm: the pads overlap"),
-        ("[device]\nguard_mm = { gap = 0, width = 8 }\n", "device.guard_mm.gap: found 0 mm: the guard lies"),
-        ("[tissue]\ncutis_mm = -2\n", "tissue.cutis_mm: found -2 mm"),
-        ("[device]\ngauge_mm = 0.036\n", "device.gauge_mm: found 0.036 mm, probably 1000 times too small"),
-        ("[tissue]\narm_radius_mm = 20\n", "tissue.arm_radius_mm: found 20 mm"),
+        ("[device]\ngauge_mm = 0\n", "device.gauge_mm: it is 0 mm, so the pads overlap"),
+        (
+            "[device]\nguard_mm = { gap = 0, width = 8 }\n",
+            "device.guard_mm.gap: it is 0 mm, so the guard lies",
+        ),
+        ("[tissue]\ncutis_mm = -2\n", "tissue.cutis_mm: it is -2 mm"),
+        ("[device]\ngauge_mm = 0.036\n", "device.gauge_mm: it is 0.036 mm, probably 1000 times too small"),
+        ("[tissue]\narm_radius_mm = 20\n", "tissue.arm_radius_mm: it is 20 mm"),
         ("[device]\nguard_mm = false\nforce_on = 'pad and guard'\n", "device.force_on"),
-        ("[device]\nguage_mm = 36\n", "device.guage_mm: found an unknown key"),
-        ("[device]\npad_mm = 8\n", "device.pad_mm: found 8"),
+        ("[device]\nguage_mm = 36\n", "device.guage_mm: this key is not known"),
+        ("[device]\npad_mm = 8\n", "device.pad_mm: 8 is not allowed; it must be a list"),
         ("guard", "device.toml"),
     ],
 )
@@ -98,10 +101,14 @@ def test_a_wrong_device_is_one_line_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("unit", "device", "says"),
     [
-        (1e3, FLAT, "probably in millimetres"),
-        (1.0, f"[device]\ngauge_mm = 40\n{FLAT}", "right_patch: found x 18 to 26 mm; expected x 20 to 28 mm"),
-        (1.0, f"[device]\nguard_mm = false\n{FLAT}", "u_right: found a guard"),
-        (1.0, f"{FLAT}cutis_mm = 3\n", "top_layer: found z 8 to 10 mm"),
+        (1e3, FLAT, "probably millimetres"),
+        (
+            1.0,
+            f"[device]\ngauge_mm = 40\n{FLAT}",
+            "right_patch: the mesh extends over x 18 to 26 mm; the device and the tissue require x 20",
+        ),
+        (1.0, f"[device]\nguard_mm = false\n{FLAT}", "u_right: the mesh has a guard"),
+        (1.0, f"{FLAT}cutis_mm = 3\n", "top_layer: the mesh extends over z 8 to 10 mm"),
     ],
 )
 def test_a_mesh_of_another_device_is_refused(
@@ -131,7 +138,10 @@ def test_new_writes_the_device_into_the_configuration(bayeskin: Command, tmp_pat
     assert parameter_space(config).names[-1] == "cutis_m"
     code, line = bayeskin("diagnose", tmp_path / "case.toml")
     assert code == 2
-    assert "found none for this device and tissue; expected a reduced model that `bayeskin reduce`" in line
+    assert (
+        "there is none for this device and tissue; make it from the device's file with `bayeskin reduce`"
+        in line
+    )
     assert not (tmp_path / "case").exists()
 
 
@@ -153,7 +163,7 @@ def test_a_shipped_surrogate_stays_with_its_device(bayeskin: Command, tmp_path: 
     )
     code, line = bayeskin("design", tmp_path / "case.toml")
     assert code == 2
-    assert "surrogate.file demo.h5: found a surrogate of another device or tissue" in line
+    assert "surrogate.file demo.h5: it belongs to another device or tissue" in line
 
 
 def test_the_demo_comes_with_its_own_device(bayeskin: Command, tmp_path: Path) -> None:
@@ -170,9 +180,9 @@ UNCERTAIN = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\n"
 @pytest.mark.parametrize(
     ("device", "says"),
     [
-        ("[tissue]\ncutis_mm = 4.0\n", "a reduced model that `bayeskin reduce` makes"),
-        ("[device]\ngauge_mm = 0\n", "device.gauge_mm: found 0 mm: the pads overlap"),
-        (None, "device.toml: found no such file"),
+        ("[tissue]\ncutis_mm = 4.0\n", "make it from the device's file with `bayeskin reduce`"),
+        ("[device]\ngauge_mm = 0\n", "device.gauge_mm: it is 0 mm, so the pads overlap"),
+        (None, "device.toml: there is no such file"),
     ],
     ids=["no reduced model", "impossible", "absent"],
 )
@@ -195,7 +205,7 @@ def test_a_device_beside_a_configuration_which_states_its_own_is_refused(
     (tmp_path / "case.toml").write_text(f'[recording]\nfile = "{short.name}"\n')
     code, line = bayeskin("diagnose", tmp_path / "case.toml", "--device", tmp_path / "device.toml")
     assert (code, line[:20]) == (2, "bayeskin: --device: ")
-    assert "device.toml together with a configuration; expected its sections [device] and [tissue]" in line
+    assert "device.toml cannot be given with a configuration; use the configuration's sections" in line
     assert {file.name for file in tmp_path.iterdir()} == {"short.h5", "device.toml", "case.toml"}
 
 
@@ -206,5 +216,5 @@ def test_a_recording_beyond_what_the_reduced_model_was_trained_for_is_refused(
     storage.save(short, replace(recording, displacement_m=6.0 * recording.displacement_m))
     code, line = bayeskin("diagnose", short)
     assert code == 2
-    assert "short.h5: found a protocol that article-device-reduced.h5 was not trained for" in line
+    assert "short.h5: article-device-reduced.h5 was not trained for this protocol" in line
     assert "the pads open by 12.00 mm, more than the trained 10 mm" in line

@@ -34,7 +34,12 @@ def test_everything_can_be_stated(bayeskin: Command, tmp_path: Path) -> None:
         "column 'cell' read as force in mN (stated by --unit)",
         "--zero subtracted the first displacement, 7 mm",
     ]
-    assert said["columns"]["displacement"] == {"number": 2, "header": "pull", "factor_to_si": -1e-3}
+    assert said["columns"]["displacement"] == {
+        "number": 2,
+        "header": "pull",
+        "unit": "mm",
+        "factor_to_si": -1e-3,
+    }
     assert said["zero_m"] == pytest.approx(7e-3)
     recording = storage.load(tmp_path / "r.h5", Recording)
     np.testing.assert_allclose(1e3 * recording.displacement_m, PULLED_MM, atol=1e-9)
@@ -59,11 +64,11 @@ def test_the_text_has_the_answer_and_stderr_what_was_taken_for_what(
         (["--unit", "mass=kg"], ["'mass'", "one of time, displacement, force"]),
         (["--unit", "force=psi"], ["--unit force=psi", "the unit 'psi'", "N, kN"]),
         (["--unit", "force=--N"], ["the unit '-N'"]),
-        (["--unit", "force=N", "--unit", "force=mN"], ["once for a quantity"]),
+        (["--unit", "force=N", "--unit", "force=mN"], ["once for each quantity"]),
         (["--time", "9"], ["--time 9", "1 'clock', 2 'pull', 3 'cell'", "a number from 1 to 3"]),
         (["--force", "load"], ["--force load", "3 'cell'"]),
-        (["--time", "1", "--displacement", "2", "--force", "3"], ["without a known unit", "--unit time"]),
-        (["--sheet", "7"], ["the tables ['1']", "a sheet '7'"]),
+        (["--time", "1", "--displacement", "2", "--force", "3"], ["is not known", "--unit time"]),
+        (["--sheet", "7"], ["no sheet or table '7'", "use one of '1'"]),
     ],
 )  # fmt: skip
 def test_a_statement_that_does_not_fit_is_refused(
@@ -124,7 +129,7 @@ def test_names_that_are_not_utf8_are_read_and_written(bayeskin: Command, tmp_pat
     assert said.splitlines()[-1].endswith("r\\xe9sultat.h5")
     assert len(storage.load(out, Recording).time_s) == len(TIME_S)
     assert_refused(
-        bayeskin("new", source, "-o", tmp_path / "c.toml"), "a name that a configuration cannot contain"
+        bayeskin("new", source, "-o", tmp_path / "c.toml"), "a configuration cannot contain this name"
     )
 
 

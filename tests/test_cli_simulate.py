@@ -173,19 +173,19 @@ def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
         (["--figures", "figures", "--at", "nan"], ("--at nan", "0 to 130 s")),
         (["--figures", "figures", "--at", "soon"], ("--at", "soon")),
         (["--at", "3"], ("--at 3", "--figures DIR")),
-        (["--figures", "file/figures"], ("--figures file/figures", "found the file file; expected a folder")),
-        (["--fields", "file"], ("--fields file", "found the file file; expected a folder")),
+        (["--figures", "file/figures"], ("--figures file/figures", "file is a file; it must be a folder")),
+        (["--fields", "file"], ("--fields file", "file is a file; it must be a folder")),
         (
             ["--fields", "fields", "--observation", "article", "--mesh", "SKIN.msh"],
-            ("--fields, --figures", "'article', whose stresses differ from those of the fields"),
+            ("--fields, --figures", "the stresses of observation 'article'"),
         ),
         (
             ["--figures", "figures", "--mechanism", "strain-stiffening"],
-            ("--mechanism strain-stiffening", "fields are of the base law"),
+            ("the mechanism strain-stiffening", "fields are of the base law"),
         ),
         (
             ["--fields", "fields", "--mechanism", "pad-slip", "--mechanism", "preconditioning"],
-            ("--mechanism preconditioning", "fields are of the base law"),
+            ("the mechanism preconditioning", "fields are of the base law"),
         ),
     ],
 )
@@ -248,7 +248,7 @@ def test_wrong_options_are_refused(
 
 def test_an_output_of_an_unknown_kind_is_refused(bayeskin: Command, measured: Path, tmp_path: Path) -> None:
     assert_refused(bayeskin("simulate", "--recording", measured, "-o", tmp_path / "f.xls"), ".csv or .h5")
-    assert_refused(bayeskin("import", measured, "-o", tmp_path / "r.csv"), "ending .h5")
+    assert_refused(bayeskin("import", measured, "-o", tmp_path / "r.csv"), "use .h5")
 
 
 def test_a_mesh_without_the_named_boundaries_is_refused(

@@ -102,11 +102,11 @@ def test_a_run_that_comes_back_twice_is_one_row(tmp_path: Path, expected: Design
 
 def test_an_address_where_nobody_answers_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bayeskin.execution.cluster.CONNECT_S", 1)
-    with pytest.raises(InputError, match="9: found no answer"), on_scheduler("tcp://127.0.0.1:9"):
+    with pytest.raises(InputError, match="9: it does not answer"), on_scheduler("tcp://127.0.0.1:9"):
         pass
     with pytest.raises(InputError, match="the address of a Dask scheduler"), on_scheduler("nowhere://x"):
         pass
-    with pytest.raises(InputError, match="foo: found no host and port"), on_scheduler("foo"):
+    with pytest.raises(InputError, match="foo: it has no host and port"), on_scheduler("foo"):
         pass
 
 

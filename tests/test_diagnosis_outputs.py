@@ -171,13 +171,18 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     assert "The full model fails at the best values: it folds" in in_words(
         {**answer, "full_model": {"message": "it folds"}}
     )
+    says = {"sd_alone": {"E_c": 0.1, "E_s": 0.8, "k_c": 1.0}, "widens": {"E_c": 2.5, "E_s": 1.1, "k_c": 1.0}}
+    nothing = {"sd_alone": {"E_c": 1.0}, "widens": {"E_c": 1.0}}
     pair = [
-        {"name": "A", "rms_n": 2e-3, "noise_n": 1e-3, "tension": 0.4, "contradicts": False},
-        {"name": "B", "rms_n": 5e-3, "noise_n": 1e-3, "tension": 5.2, "contradicts": True},
-        {"name": "C", "rms_n": 5e-3, "noise_n": 1e-3, "tension": None, "contradicts": False},
+        {"name": "A", "rms_n": 2e-3, "noise_n": 1e-3, "tension": 0.4, "contradicts": False, **says},
+        {"name": "B", "rms_n": 5e-3, "noise_n": 1e-3, "tension": 5.2, "contradicts": True, **nothing},
+        {"name": "C", "rms_n": 5e-3, "noise_n": 1e-3, "tension": None, "contradicts": False, **nothing},
     ]
     joint = in_words({**answer, "recordings": pair})
     assert "A agrees with the others, by 0.4 sd: RMS residual 2.0 mN, 2.0 sd of its noise" in joint
+    assert "A alone informs E_c and weakly E_s; without it, the intervals would be wider by these" in joint
+    assert "factors: E_c 2.5\n" in joint
+    assert "B alone informs no parameter of the skin; without it, no interval would be much wider" in joint
     assert "B contradicts the others, by 5.2 sd" in joint
     assert "C: RMS residual 5.0 mN, 5.0 sd of its noise; it could not be fitted alone" in joint
     faint = in_words({**answer, "verdict": "nothing-missing", "best_set": ["pre-stretch"]})

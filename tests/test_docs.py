@@ -32,7 +32,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    return [Block(*found) for found in FENCE.findall(page.read_text(encoding="utf-8"))]
+    return [Block(*parts) for parts in FENCE.findall(page.read_text(encoding="utf-8"))]
 
 
 def run_page(page: Path, folder: Path, slow: bool, monkeypatch: pytest.MonkeyPatch) -> int:
@@ -48,7 +48,7 @@ def run_page(page: Path, folder: Path, slow: bool, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("PATH", str(shim.parent), prepend=":")
     monkeypatch.setattr(sys, "path", list(sys.path))
     names: dict[str, object] = {"__name__": "page"}
-    wanted = [one for one in blocks(page) if one.when == "" or (slow and one.when == "slow")]
+    wanted = [block for block in blocks(page) if block.when == "" or (slow and block.when == "slow")]
     for block in wanted:
         if block.language == "python":
             exec(compile(block.text, str(page), "exec"), names)
@@ -106,9 +106,9 @@ def test_every_command_that_the_pages_name_exists() -> None:
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         shell = "\n".join(block.text for block in blocks(page) if block.language == "sh")
-        found = re.findall(r"(?:^    |`)(?:\.venv/bin/)?bayeskin ([a-z]+)\b", text, re.M)
-        found += re.findall(r"\bbayeskin ([a-z]+)\b", shell)
-        assert set(found) <= set(cli.commands), page
+        commands = re.findall(r"(?:^    |`)(?:\.venv/bin/)?bayeskin ([a-z]+)\b", text, re.M)
+        commands += re.findall(r"\bbayeskin ([a-z]+)\b", shell)
+        assert set(commands) <= set(cli.commands), page
     assert set(cli.commands) <= set(re.findall(r"`bayeskin ([a-z]+)", (ROOT / "README.md").read_text()))
 
 

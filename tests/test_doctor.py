@@ -29,7 +29,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def broken(said: dict[str, Any]) -> dict[str, str]:
-    return {finding["name"]: finding["found"] for finding in said["findings"] if not finding["ok"]}
+    return {finding["name"]: finding["state"] for finding in said["findings"] if not finding["ok"]}
 
 
 def test_the_models_give_the_stored_numbers_here(
@@ -58,7 +58,7 @@ def test_a_model_that_gives_another_number_is_broken(
     monkeypatch.setattr(doctor_models, number, 1.01 * getattr(doctor_models, number))
     finding = doctor_models.CHECKS[name]()
     assert (finding.name, finding.ok) == (name, False)
-    assert "within" in finding.advice
+    assert "within" in finding.needed
 
 
 USES = """
@@ -115,7 +115,7 @@ def test_a_package_that_is_absent_or_too_old_is_named(
     shown = capsys.readouterr().out
     assert end.value.code == 1
     assert "BROKEN  numpy" in shown
-    assert "expected >=99" in shown
+    assert "needed: >=99" in shown
     assert "BROKEN  no-such-package: not installed" in shown
     assert "ok      scipy" in shown
     assert "no-such-wheel" not in shown  # needed elsewhere only
@@ -145,7 +145,7 @@ def test_a_folder_without_room_or_access_is_told(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(tempfile, "TemporaryFile", denied)
     assert broken(doctor.examine(tmp_path, Silent())) == {
         "disk space": "0.0 GB free",
-        "write access": f"{tmp_path}: Permission denied",
+        "write access": f"{tmp_path}: permission denied",
     }
 
 

@@ -51,9 +51,9 @@ def test_a_diagnosis_solves_what_acts_on_the_force_beside_a_model_of_one_s_own(c
     measured = storage.load(file, Recording)
     storage.save(file, dataclasses.replace(measured, force_n=measured.force_n - 0.03))
     said = diagnose(case, Silent())
-    (one,) = said["mechanisms"]
-    assert one["name"] == "force-offset"
-    offset = one["parameters"]["F0"]
+    (mechanism,) = said["mechanisms"]
+    assert mechanism["name"] == "force-offset"
+    offset = mechanism["parameters"]["F0"]
     assert abs(offset["mean"] + 0.03) < 4.0 * offset["sd"] < 0.01
     assert said["full_model"]["rmse"] < NOISE_N
     for name, value in TRUE.items():
@@ -103,9 +103,9 @@ def test_a_function_that_raises_is_a_run_that_failed() -> None:
     def raising(theta, time_s, displacement_m):
         raise ValueError("too\nstiff")
 
-    found = simulate_with(raising, MOTION, TRUE)
-    assert found.status == "failed"
-    assert found.message.startswith("ValueError: too stiff (test_external_functions.py, line ")
+    run = simulate_with(raising, MOTION, TRUE)
+    assert run.status == "failed"
+    assert run.message.startswith("ValueError: too stiff (test_external_functions.py, line ")
 
 
 def test_a_function_is_asked_for_no_time_twice() -> None:
@@ -125,18 +125,18 @@ def test_a_function_is_asked_for_no_time_twice() -> None:
         ("absent.py:force", PARAMETERS, "absent.py"),
         ("spring.py:absent", PARAMETERS, "no function absent"),
         ("spring.py:number", PARAMETERS, "no function number"),
-        ("spring.py", PARAMETERS, "expected FILE.py:FUNCTION"),
-        ("nowhere.at.all:force", PARAMETERS, "expected a Python file or module"),
+        ("spring.py", PARAMETERS, "write FILE.py:FUNCTION"),
+        ("nowhere.at.all:force", PARAMETERS, "name a Python file or module"),
         ("broken.py:force", PARAMETERS, "SyntaxError"),
         ("spring.py:raising", PARAMETERS, "ZeroDivisionError: division by zero (spring.py, line "),
-        ("spring.py:short", PARAMETERS, "a force of shape (3,); expected shape (1"),
+        ("spring.py:short", PARAMETERS, "its forces is (3,); it must be (1"),
         ("spring.py:endless", PARAMETERS, "not finite"),
         ("spring.py:force", "", "KeyError: 'stiffness'"),
-        ("spring.py:force", "[parameters.stiffness]\nlower = 1.0\n", "stiffness.upper: found nothing"),
-        ("spring.py:force", PARAMETERS + '[surrogate]\nfile = "demo.h5"\n', "a surrogate of another model"),
-        ("ftp://here", PARAMETERS, "expected http://HOST:PORT"),
-        ("http://here:port", PARAMETERS, "expected http://HOST:PORT"),
-        ("http://127.0.0.1:9", PARAMETERS, "no answer"),
+        ("spring.py:force", "[parameters.stiffness]\nlower = 1.0\n", "stiffness.upper: there is no value"),
+        ("spring.py:force", PARAMETERS + '[surrogate]\nfile = "demo.h5"\n', "it belongs to another model"),
+        ("ftp://here", PARAMETERS, "http://HOST:PORT"),
+        ("http://here:port", PARAMETERS, "http://HOST:PORT"),
+        ("http://127.0.0.1:9", PARAMETERS, "no server answers"),
     ],
 )
 def test_what_cannot_be_used_is_told_in_one_line(
@@ -150,10 +150,12 @@ def test_what_cannot_be_used_is_told_in_one_line(
 def test_own_and_full_models_are_not_mixed(case: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = case.parent / "f.csv"
     for option in (("--fields", "f"), ("--figures", "f"), ("--mechanism", "force-offset")):
-        assert "no fields, figures or mechanisms" in refused(capsys, "simulate", case, *option, "-o", out)
+        assert "leave out fields, figures and mechanisms" in refused(
+            capsys, "simulate", case, *option, "-o", out
+        )
     assert "a model of your own" in refused(capsys, "simulate", case, "--mesh", "bricks", "-o", out)
     case.write_text(case.read_text().replace('forward = "spring.py:force"', 'observation = "own"'))
-    assert "expected 'own' with model.forward" in refused(capsys, "simulate", case, "-o", out)
+    assert "it must be 'own' with model.forward" in refused(capsys, "simulate", case, "-o", out)
 
 
 def test_simulate_runs_it(case: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -92,12 +92,12 @@ def test_a_server_of_the_package_umbridge_gives_what_the_function_gives(umbridge
     np.testing.assert_array_equal(run.time_s, direct.time_s)
     np.testing.assert_allclose(run.force_n, direct.force_n, rtol=1e-12)
     with pytest.raises(
-        InputError, match=r"several models; expected #NAME after the URL, one of spring, other"
+        InputError, match=r"several models; write #NAME after the URL, with one of spring, other"
     ):
         simulate_server(umbridge_url, MOTION, TRUE)
-    with pytest.raises(InputError, match="no model 'wing'; expected one of spring, other"):
+    with pytest.raises(InputError, match="no model 'wing'; use one of spring, other"):
         simulate_server(f"{umbridge_url}#wing", MOTION, TRUE)
-    with pytest.raises(InputError, match="a model of 3 inputs; expected 2: stiffness, share"):
+    with pytest.raises(InputError, match="inputs is 3; it must be 2: stiffness, share"):
         simulate_server(f"{umbridge_url}#spring", MOTION, {"stiffness": 1.0, "share": 0.0})
 
 
@@ -132,7 +132,7 @@ def test_ours_answers_the_client_of_the_package_umbridge(served: str) -> None:
 def test_a_mechanism_whose_parameter_has_the_models_name_is_refused() -> None:
     own = (Parameter("F0", "N", 0.0, 1.0, "uniform"),)
     model = ServedModel(ModelSpec(), own, Asked(MOTION, np.arange(0.0, 131.0), None, ()))
-    with pytest.raises(InputError, match="found F0 twice"):
+    with pytest.raises(InputError, match="the name F0"):
         model.input_sizes({"mechanisms": ["force-offset"]})
 
 
@@ -167,20 +167,24 @@ def test_instrument_mechanisms_bring_their_parameters(served: str) -> None:
 @pytest.mark.parametrize(
     ("inputs", "config", "says"),
     [
-        ([[1.0, 2.0]], {}, "lengths [2]; expected lengths [3]"),
-        ([[1.0, 2.0, "3"]], {}, "found '3'; expected finite numbers"),
-        ([[1.0, 2.0, 3.0]], {"colour": 1}, "config: colour: found an unknown key; expected one of protocol"),
+        ([[1.0, 2.0]], {}, "lengths [2]; the lengths must be [3]"),
+        ([[1.0, 2.0, "3"]], {}, "'3' is not a finite number"),
+        ([[1.0, 2.0, 3.0]], {"colour": 1}, "config: colour: this key is not known; use some of protocol"),
         ([[1.0, 2.0, 3.0]], {"protocol": [1]}, "config: protocol"),
         ([[1.0, 2.0, 3.0]], {"protocol": {"time_s": [1, 2], "displacement_m": [0, 1]}}, "increase from 0"),
         (
             [[1.0, 2.0, 3.0]],
             {"protocol": {"time_s": [0, 2], "displacement_m": [0]}},
-            "2 times, 1 displacements",
+            "2 times and 1 displacements",
         ),
-        ([[1.0, 2.0, 3.0]], {"times_s": [3.0, 500.0]}, "times within the protocol's 0 to 130 s"),
-        ([[1.0, 2.0, 3.0]], {"edges_s": [3.0]}, "1 edges"),
-        ([[1.0, 2.0, 3.0]], {"mechanisms": ["wings"]}, "'wings'; expected some of amplifier-lag"),
-        ([[1.0, 2.0, 3.0]], {"mechanisms": ["solid-viscoelasticity"]}, "lengths [3]; expected lengths [7]"),
+        ([[1.0, 2.0, 3.0]], {"times_s": [3.0, 500.0]}, "within the protocol, 0 to 130 s"),
+        ([[1.0, 2.0, 3.0]], {"edges_s": [3.0]}, "the number of edges is 1"),
+        ([[1.0, 2.0, 3.0]], {"mechanisms": ["wings"]}, "'wings' is not known; use some of amplifier-lag"),
+        (
+            [[1.0, 2.0, 3.0]],
+            {"mechanisms": ["solid-viscoelasticity"]},
+            "lengths [3]; the lengths must be [7]",
+        ),
         (
             [[1.0, 2.0, 3.0, 0.1, 0.1, 1.0, 2.0]],
             {"mechanisms": ["solid-viscoelasticity"]},
@@ -220,7 +224,7 @@ def test_the_full_model_is_served(served: str) -> None:
         config = {"protocol": protocol, "times_s": [2.0]}
         assert model.get_input_sizes(config) == [5]
         assert model([list(THETA.values())], config)[0][0] == pytest.approx(FULL_MODEL_N, rel=1e-3)
-        with pytest.raises(Exception, match=r"InvalidInput.*E_c: found -1"):
+        with pytest.raises(Exception, match=r"InvalidInput.*E_c: it is -1"):
             model([[-1.0, *list(THETA.values())[1:]]], config)
 
 
@@ -315,7 +319,9 @@ def test_a_server_that_goes_away_costs_no_finished_run_and_fails_none(tmp_path: 
     run = partial(simulate_server, url, MOTION)
     with (
         Store(tmp_path / "a.store", url) as store,
-        pytest.raises(Unavailable, match=r"no answer .*; expected a server that speaks UM-Bridge"),
+        pytest.raises(
+            Unavailable, match=r"no server answers .*; bayeskin needs a server that speaks UM-Bridge"
+        ),
     ):
         run_design(store, wave, edges_s, run, identity(url), local(1))
     kept = len((tmp_path / "a.store").read_bytes().splitlines()) - 1

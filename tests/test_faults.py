@@ -99,7 +99,7 @@ def test_a_real_disk_that_is_full_is_told(case: Path, bayeskin: Command) -> None
         for name in ("case.toml", "spring.py"):
             shutil.copy(case.parent / name, disk)
         (disk / "measured.h5").symlink_to(case.parent / "measured.h5")
-        refused(bayeskin("design", disk / "case.toml"), "No space left on device")
+        refused(bayeskin("design", disk / "case.toml"), "no space left on device")
         refused(bayeskin("import", disk / "measured.h5", "-o", disk / "again.h5"), "")
         assert not (disk / "again.h5").exists()
     finally:
@@ -164,7 +164,7 @@ def test_a_read_only_folder_is_told(case: Path) -> None:
         assert done.stdout.split() == ["2", "2", "2"]
         assert "Traceback" not in done.stderr
         told = [line for line in done.stderr.splitlines() if line.startswith("bayeskin: ")]
-        assert ["Permission denied" in line for line in told] == [True, True, True]
+        assert ["permission denied" in line for line in told] == [True, True, True]
         assert sorted(p.name for p in case.parent.iterdir()) == ["case.toml", "measured.h5", "spring.py"]
     finally:
         case.parent.chmod(0o755)
@@ -175,7 +175,7 @@ def test_a_folder_that_is_not_the_runs_own_is_left_as_it_is(case: Path, bayeskin
     lab_book = case.parent / "case" / "recording" / "lab-book.txt"
     lab_book.parent.mkdir(parents=True)
     lab_book.write_text("measured on Monday")
-    refused(bayeskin("design", case), "case/recording: found other files, among them lab-book.txt")
+    refused(bayeskin("design", case), "case/recording: it contains other files, such as lab-book.txt")
     assert lab_book.read_text() == "measured on Monday"
 
 
@@ -184,7 +184,7 @@ def test_a_link_to_another_place_is_not_written_through(case: Path, bayeskin: Co
     other.mkdir()
     (case.parent / "case").mkdir()
     (case.parent / "case" / "recording").symlink_to(other, target_is_directory=True)
-    refused(bayeskin("design", case), "case/recording: found a link to another place")
+    refused(bayeskin("design", case), "case/recording: it is a link to another place")
     assert not list(other.iterdir())
 
 
@@ -206,9 +206,7 @@ def test_a_second_run_on_a_folder_is_refused_and_the_first_goes_on(case: Path, b
     while not lock.is_file() or lock.read_text() != str(first.pid):
         assert first.poll() is None
         time.sleep(0.05)
-    refused(
-        bayeskin("train", case), f"in use by another bayeskin (process {first.pid}); expected one process"
-    )
+    refused(bayeskin("train", case), f"another bayeskin (process {first.pid}) uses this folder")
     go.touch()
     assert first.wait() == 0
     assert len(load_design(case.parent / "case/design/design.h5").theta) == 30
@@ -236,11 +234,11 @@ def cut(path: Path) -> None:
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
-        (altered_surrogate, "contents that differ from their stored hash"),
-        (later_format, "format version 99"),
+        (altered_surrogate, "its contents differ from their stored hash"),
+        (later_format, "format is 99"),
         (of_somebody_else, "another origin"),
-        (cut, "not readable as HDF5"),
-        (lambda path: path.write_bytes(b""), "not readable as HDF5"),
+        (cut, "cannot be read as HDF5"),
+        (lambda path: path.write_bytes(b""), "cannot be read as HDF5"),
     ],
     ids=["altered", "later", "foreign", "cut", "empty"],
 )
@@ -261,7 +259,7 @@ def test_a_surrogate_of_another_model_is_refused(tmp_path: Path, bayeskin: Comma
     shutil.copy(ROOT / "data/demo.h5", tmp_path / "measured.h5")
     config = '[recording]\nfile = "measured.h5"\n[model]\nrefinement = 2\n[surrogate]\nfile = "demo.h5"\n'
     (tmp_path / "case.toml").write_text(config)
-    refused(bayeskin("train", tmp_path / "case.toml"), "a surrogate of another model")
+    refused(bayeskin("train", tmp_path / "case.toml"), "it belongs to another model")
 
 
 @pytest.mark.parametrize(

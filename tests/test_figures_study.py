@@ -72,7 +72,7 @@ def test_many_recordings_and_groups_fit_on_a_page(groups: tuple[str, ...]) -> No
     entries = table(subjects=96, groups=groups)
     medians = {group: about(1e5) for group in groups or ("",)}
     contrasts = tuple(Contrast("group", "a", b, about(1.5), 0.9) for b in groups[1:])
-    one = population(entries, {"medians": medians, "contrasts": contrasts})
-    for figure in (report.figure_recordings(one), report.figure_population(one)):
+    result = population(entries, {"medians": medians, "contrasts": contrasts})
+    for figure in (report.figure_recordings(result), report.figure_population(result)):
         assert drawn(figure).get_figheight() < 11.0
-    assert len(report.figure_recordings(one).axes[0].get_yticks()) >= 48
+    assert len(report.figure_recordings(result).axes[0].get_yticks()) >= 48

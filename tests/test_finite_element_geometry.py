@@ -103,7 +103,7 @@ def test_a_mesh_like_another_has_its_cells_with_nodes_moved_by_layer():
     assert volumes[~like.cutis].sum() == pytest.approx(0.105 * 0.084 * 36e-3, rel=5e-3)
     assert brick_mesh(1, thicker).geometry.p.max() > like.geometry.p.max()  # whose box is its own
     np.testing.assert_array_equal(brick_mesh(1, reference, like=reference).geometry.p, mesh.geometry.p)
-    with pytest.raises(InputError, match="other pads or another guard"):
+    with pytest.raises(InputError, match="its pads or its guard differ"):
         brick_mesh(1, PADS, like=reference)
 
 
@@ -173,5 +173,5 @@ def test_pre_stretch_opens_the_pads_by_a_share_of_this_gauge():
 @pytest.mark.parametrize("observation", ["article", "own"])
 def test_observations_that_know_one_device_refuse_another(observation):
     options = {"mesh": "some.msh"} if observation == "article" else {"forward": "http://localhost:1"}
-    with pytest.raises(InputError, match="geometry: found settings other than the article's"):
+    with pytest.raises(InputError, match="geometry: it is not the article's"):
         ModelSpec(observation=observation, geometry=PADS, **options)

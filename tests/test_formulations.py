@@ -55,7 +55,7 @@ def test_what_a_formulation_does_not_offer_is_refused(spec: ModelSpec) -> None:
         ("gradients", {"gradients": {"E_c": 1e3}}),
         ("tissue mechanisms", {"laws": [lambda values, sites: TissueLaw()]}),
     ):
-        with pytest.raises(InputError, match=f"{where}: found observation '{spec.observation}'"):
+        with pytest.raises(InputError, match=f"{where}: observation '{spec.observation}'"):
             simulate(spec, MOTION, THETA, **asked)
 
 

@@ -202,7 +202,7 @@ def test_the_file_that_libhdf5_reads_for_ever_is_refused(
     path.write_bytes(as_hdf5(tmp_path))
     monkeypatch.setattr(probe, "READ_ALL", "import time; time.sleep(600)")
     monkeypatch.setattr(probe, "STARTS_S", 0.5)
-    with pytest.raises(InputError, match=r"not readable as HDF5 \(reading it does not end\)"):
+    with pytest.raises(InputError, match=r"cannot be read as HDF5 \(reading it does not end\)"):
         read_recording(path)
     path.write_bytes(as_hdf5(tmp_path))
     os.utime(path, (1, 1))
@@ -216,7 +216,7 @@ def test_an_hdf5_bomb_is_refused_before_it_takes_the_memory(tmp_path: Path) -> N
     with h5py.File(tmp_path / "a.h5", "w") as handle:
         handle.attrs["format"] = "bayeskin"
         handle.create_dataset("time_s", shape=(2**32,), dtype="f8", compression="gzip", chunks=(2**20,))
-    with pytest.raises(InputError, match=r"not readable as HDF5 \(.*Memory"):
+    with pytest.raises(InputError, match=r"cannot be read as HDF5 \(.*Memory"):
         read_recording(tmp_path / "a.h5")
 
 
@@ -229,5 +229,5 @@ def test_a_workbook_that_unpacks_to_more_than_any_recording_is_refused(tmp_path:
         for _ in range(1100):
             part.write(b" " * 2**20)
     assert (tmp_path / "a.xlsx").stat().st_size < 5e6
-    with pytest.raises(InputError, match=r"1\.2e\+09 bytes when unpacked; expected at most 1\.1e\+09"):
+    with pytest.raises(InputError, match=r"1\.2e\+09 bytes when unpacked; .* at most 1\.1e\+09"):
         read_recording(tmp_path / "a.xlsx")

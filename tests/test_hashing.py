@@ -160,7 +160,7 @@ def test_the_hash_is_the_same_by_every_version_of_python() -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("source", "other"),
     [
         ("x = 'a'", 'x = ("a")'),
         ("x = 'a' 'b'", "x = u'''ab'''"),
@@ -174,12 +174,12 @@ def test_the_hash_is_the_same_by_every_version_of_python() -> None:
         ("x = 1", "\ufeffx = 1\r\n"),
     ],
 )
-def test_wording_and_layout_do_not_count(one: str, other: str) -> None:
-    assert hashed(one) == hashed(other)
+def test_wording_and_layout_do_not_count(source: str, other: str) -> None:
+    assert hashed(source) == hashed(other)
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("source", "other"),
     [
         ("x = 1", "x = 2"),
         ("x = 1", "x = 1.0"),
@@ -227,10 +227,10 @@ def test_wording_and_layout_do_not_count(one: str, other: str) -> None:
         ("def f():\n    f'Says it.'", "def f(): pass"),
     ],
 )
-def test_whatever_may_change_a_result_counts(one: str, other: str) -> None:
-    ast.parse(one)
+def test_whatever_may_change_a_result_counts(source: str, other: str) -> None:
+    ast.parse(source)
     ast.parse(other)
-    assert hashed(one) != hashed(other)
+    assert hashed(source) != hashed(other)
 
 
 @pytest.mark.parametrize(

@@ -140,18 +140,18 @@ def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:
     few = {name: KNOWN[name] for name in ("device-friction", "friction-creep")}
     pair = ("device-friction", "friction-creep")
     said = {(): Evidences(0.0, 0.0), pair: Evidences(30.0, 0.0)}
-    family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
-    assert [one.name for one in judge_family(family, few, 1.0).named] == list(pair)
+    family = Family([hypothesis for names, its in said.items() for hypothesis in hypotheses_of(names, its)])
+    assert [mechanism.name for mechanism in judge_family(family, few, 1.0).named] == list(pair)
 
 
 def test_nothing_is_named_beside_something_smooth_that_is_most_of_the_misfit() -> None:
     """A friction that a Gaussian process gains by, which explains 782 nats by itself."""
     said = {(): Evidences(0.0, 782.0), ("device-friction",): Evidences(30.0, 830.0)}
-    family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
+    family = Family([hypothesis for names, its in said.items() for hypothesis in hypotheses_of(names, its)])
     assert family.probability(["device-friction"]) > 0.99
     little = judge_family(family, KNOWN, 0.8)
     assert (little.verdict, little.named) == ("unknown", ())
-    (one,) = judge_family(family, KNOWN, 0.95).named
-    assert one.name == "device-friction"
+    (mechanism,) = judge_family(family, KNOWN, 0.95).named
+    assert mechanism.name == "device-friction"
     alone = Family(hypotheses_of(("device-friction",), Evidences(30.0, 20.0)))
     assert judge_family(alone, KNOWN, 0.2).verdict == "named"  # nothing smooth: a small effect is one

@@ -59,11 +59,11 @@ def test_few_draws_move_the_mean_of_many_by_what_the_weights_say() -> None:
     many = draws(problem, 20000)
     mean = gaussian(problem, np.zeros((40, 40)))[0]
     few = [draws(problem, 24, seed=seed) for seed in range(1, 101)]
-    moved = [corrected(weigh(problem, one, full_force(one)), many)[1] for one in few]
-    off = np.array([one.quantiles[1] for one in moved]) - mean[1]
-    alone = np.array([one[:, 1].mean() for one in few]) - mean[1]
+    moved = [corrected(weigh(problem, sample, full_force(sample)), many)[1] for sample in few]
+    off = np.array([summary.quantiles[1] for summary in moved]) - mean[1]
+    alone = np.array([sample[:, 1].mean() for sample in few]) - mean[1]
     assert np.sqrt(np.mean(off**2)) < 0.7 * np.sqrt(np.mean(alone**2))
-    said = np.array([one.shift_error_sd for one in moved]) * many[:, 1].std()
+    said = np.array([summary.shift_error_sd for summary in moved]) * many[:, 1].std()
     assert 0.6 < np.sqrt(np.mean((off / said) ** 2)) < 1.6
 
 

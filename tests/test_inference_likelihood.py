@@ -145,9 +145,9 @@ def test_fit_windows_share_nothing_but_the_surrogate_error() -> None:
     noise = noise_vectors(len(both.kinds), 4.0, rng)
     parts = 0.0
     for window in windows:
-        one = noise_chain(binned, [window])
-        columns = [both.kinds.index(kind) for kind in one.kinds]
-        parts = parts + log_likelihood(one, prediction, noise[:, [*columns, -2, -1]])
+        chain = noise_chain(binned, [window])
+        columns = [both.kinds.index(kind) for kind in chain.kinds]
+        parts = parts + log_likelihood(chain, prediction, noise[:, [*columns, -2, -1]])
     assert log_likelihood(both, prediction, noise) == pytest.approx(parts, rel=1e-12)
 
 
@@ -299,7 +299,7 @@ def test_only_bins_wholly_inside_a_window_are_fitted() -> None:
     binned = empty_recording()
     assert np.flatnonzero(bins_in_windows(binned, [(3.5, 7.9)]) == 0).tolist() == [4, 5, 6]
     for bad in ([(5.0, 3.0)], [(0.0, 10.0), (5.0, 20.0)]):
-        with pytest.raises(InputError, match="windows in order"):
+        with pytest.raises(InputError, match="windows must be in order"):
             bins_in_windows(binned, bad)
     with pytest.raises(InputError, match="no bin"):
         noise_chain(binned, [(3.1, 3.9)])
@@ -317,9 +317,9 @@ def test_a_surrogate_of_other_bins_or_a_wider_prior_is_refused() -> None:
 
 
 def test_windows_are_the_same_as_lists_and_as_tuples() -> None:
-    one = toy_problem(windows=((15.0, 45.0),))
-    other = dataclasses.replace(one, fit_windows=[[15, 45]])
-    assert one.identity == other.identity
+    problem = toy_problem(windows=((15.0, 45.0),))
+    other = dataclasses.replace(problem, fit_windows=[[15, 45]])
+    assert problem.identity == other.identity
 
 
 SCRIPT = """
@@ -336,10 +336,10 @@ print(hashlib.sha256(values.tobytes()).hexdigest())
 @pytest.mark.slow  # compiles
 def test_it_is_the_same_to_the_last_bit_whether_just_compiled_or_loaded(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent)}
-    found = [
+    hashes = [
         subprocess.run(
             [sys.executable, "-c", SCRIPT], env=environment, check=True, capture_output=True, text=True
         ).stdout
         for _ in range(2)
     ]
-    assert found[0] == found[1] != ""
+    assert hashes[0] == hashes[1] != ""

@@ -70,8 +70,8 @@ def test_it_is_a_normal_error_of_the_force_in_the_likelihood() -> None:
 def test_chains_of_a_posterior_without_it_are_those_of_another() -> None:
     problem = toy_problem()
     errors = [ModelError(closed_form_model.MOTION, problem.binned.edges_s, sd) for sd in (0.01, 0.02)]
-    problems = [problem, *(dataclasses.replace(problem, model_error=one) for one in errors)]
-    assert len({one.identity["model error"] for one in problems}) == 3
+    problems = [problem, *(dataclasses.replace(problem, model_error=error) for error in errors)]
+    assert len({posterior.identity["model error"] for posterior in problems}) == 3
 
 
 def test_a_model_s_error_is_no_doubt_about_its_surrogate() -> None:

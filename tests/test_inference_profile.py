@@ -28,29 +28,29 @@ def test_a_linear_models_profile_is_a_parabola_of_its_standard_error() -> None:
     x = problem.surrogate.columns
     covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
     spread = np.linalg.inv(x @ np.linalg.solve(covariance, x.T))
-    for j, found in enumerate(profiles(problem, best, nothing(problem), points=101)):
-        exact = -0.5 * (found.values - best[found.name]) ** 2 / spread[j, j]
+    for j, curve in enumerate(profiles(problem, best, nothing(problem), points=101)):
+        exact = -0.5 * (curve.values - best[curve.name]) ** 2 / spread[j, j]
         near = exact > -4.0  # further out the surrogate's error leaves its three sd
         assert near.sum() > 4
-        np.testing.assert_allclose(found.drop_nats[near], exact[near], atol=0.02)
+        np.testing.assert_allclose(curve.drop_nats[near], exact[near], atol=0.02)
         half = np.sqrt(2 * DROP * spread[j, j])
-        assert found.interval == pytest.approx(
-            (best[found.name] - half, best[found.name] + half), abs=0.1 * half
+        assert curve.interval == pytest.approx(
+            (best[curve.name] - half, best[curve.name] + half), abs=0.1 * half
         )
-        assert not found.flat
+        assert not curve.flat
 
 
 def test_a_parameter_without_effect_has_a_flat_profile_and_one_with_effect_has_not(
     best: Mapping[str, float],
 ) -> None:
     problem = toy_problem()
-    found = {one.name: one for one in profiles(problem, best, nothing(problem), points=9)}
-    assert found["p_init"].flat
-    assert np.ptp(found["p_init"].drop_nats) < 0.1
-    assert found["p_init"].interval == pytest.approx((-670.0, 2144.0))
-    assert not found["E_c"].open_above
+    by_name = {curve.name: curve for curve in profiles(problem, best, nothing(problem), points=9)}
+    assert by_name["p_init"].flat
+    assert np.ptp(by_name["p_init"].drop_nats) < 0.1
+    assert by_name["p_init"].interval == pytest.approx((-670.0, 2144.0))
+    assert not by_name["E_c"].open_above
     for name in ("E_c", "k_s"):
-        low, high = found[name].interval
+        low, high = by_name[name].interval
         assert low <= TRUTH[name] <= high, name
 
 
@@ -59,12 +59,12 @@ def test_a_profile_is_nowhere_above_the_maximum_and_tops_what_holds_the_rest(
 ) -> None:
     problem = toy_problem()
     top = problem.log_likelihood(np.array([list(best.values())]))[0]
-    found = profiles(problem, best, nothing(problem), points=7)[0]
-    rows = np.tile([best[name] for name in problem.names], (len(found.values), 1))
-    rows[:, 0] = found.values
+    curve = profiles(problem, best, nothing(problem), points=7)[0]
+    rows = np.tile([best[name] for name in problem.names], (len(curve.values), 1))
+    rows[:, 0] = curve.values
     alone = problem.log_likelihood(rows) - top
-    assert np.all(found.drop_nats >= alone - 0.1)
-    assert found.drop_nats.max() == 0.0
+    assert np.all(curve.drop_nats >= alone - 0.1)
+    assert curve.drop_nats.max() == 0.0
     assert set(NOISE) <= set(problem.names)
 
 
@@ -81,8 +81,8 @@ def test_a_profile_begins_at_draws_too(best: Mapping[str, float], monkeypatch: p
         return SimpleNamespace(vector=at)
 
     monkeypatch.setattr(profile, "gauss_newton", stays)
-    without, found = (profiles(problem, best, some, points=9)[1] for some in (nothing(problem), draws))
-    assert np.all(found.drop_nats >= without.drop_nats - 1e-9)
+    without, with_draws = (profiles(problem, best, some, points=9)[1] for some in (nothing(problem), draws))
+    assert np.all(with_draws.drop_nats >= without.drop_nats - 1e-9)
     values, top = problem.log_likelihood(draws), problem.log_likelihood(np.array([list(best.values())]))[0]
-    assert np.any(found.drop_nats > without.drop_nats + 1.0)
-    assert found.drop_nats.max() <= max(values.max() - top, 0.0) + 1e-9
+    assert np.any(with_draws.drop_nats > without.drop_nats + 1.0)
+    assert with_draws.drop_nats.max() <= max(values.max() - top, 0.0) + 1e-9

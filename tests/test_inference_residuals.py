@@ -75,10 +75,10 @@ def test_other_noise_fails_and_is_named(
     draw: Callable[[np.random.Generator, Array, Array], Array], word: str
 ) -> None:
     checks = [at_truth(with_noise(draw, seed)) for seed in range(10)]
-    assert sum(not one.passes for one in checks) >= 8
-    named = [one.sentence for one in checks if not one.passes]
-    assert all(one.startswith("The residual is not the assumed noise: ") for one in named)
-    assert sum(word in one for one in named) >= 6
+    assert sum(not check.passes for check in checks) >= 8
+    named = [check.sentence for check in checks if not check.passes]
+    assert all(sentence.startswith("The residual is not the assumed noise: ") for sentence in named)
+    assert sum(word in sentence for sentence in named) >= 6
 
 
 def test_a_sine_fails_even_where_the_noise_is_fitted_to_it() -> None:

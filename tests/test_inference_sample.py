@@ -95,9 +95,9 @@ def test_a_linear_model_gets_its_gaussian_posterior(tmp_path: Path) -> None:
     assert posterior.flat[:, :2].std(axis=0) / sd == pytest.approx(1, abs=0.07)
     assert posterior.convergence.ess.min() > 1500
     # Thinned by the autocorrelation time, rounded up: so many times fewer draws than effective samples.
-    found = posterior.convergence
-    rounded = found.thin / found.tau_steps.max()
-    assert len(posterior.flat) == pytest.approx(found.ess.min() / rounded, rel=0.15)
+    convergence = posterior.convergence
+    rounded = convergence.thin / convergence.tau_steps.max()
+    assert len(posterior.flat) == pytest.approx(convergence.ess.min() / rounded, rel=0.15)
 
 
 def test_data_of_one_hold_cover_the_truth_and_leave_p_init_alone(tmp_path: Path) -> None:
@@ -123,11 +123,11 @@ def test_a_run_in_two_parts_is_the_run_in_one(whole: tuple[Path, Posterior], tmp
     sample(problem, tmp_path / "two", 7, LINE_START, SHORT)
     parts = sample(problem, tmp_path / "two", 7, LINE_START, LONGER)
     assert np.array_equal(whole[1].draws, parts.draws)
-    found = load_chains(tmp_path / "two", problem, 2)
-    assert np.array_equal(load_chains(whole[0], problem, 2), found)
-    assert not np.array_equal(*found)  # ensembles are independent
+    chains = load_chains(tmp_path / "two", problem, 2)
+    assert np.array_equal(load_chains(whole[0], problem, 2), chains)
+    assert not np.array_equal(*chains)  # ensembles are independent
     sample(problem, tmp_path / "three", 8, LINE_START, dataclasses.replace(SHORT, ensembles=1))
-    assert not np.array_equal(load_chains(tmp_path / "three", problem, 1), found[:1, :500])
+    assert not np.array_equal(load_chains(tmp_path / "three", problem, 1), chains[:1, :500])
 
 
 @pytest.mark.usefixtures("coarsely")
@@ -223,11 +223,11 @@ def other_surrogate(problem: LogPosterior) -> LogPosterior:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (other_data, "a chain of different input: recording"),
-        (other_surrogate, "a chain of different input: surrogate"),
+        (other_data, "other inputs .its recording"),
+        (other_surrogate, "other inputs .its surrogate"),
         (
             lambda p: dataclasses.replace(p, fit_windows=((0.0, 0.5),)),
-            "a chain of different input: fit windows",
+            "other inputs .its fit windows",
         ),
     ],
 )
@@ -240,15 +240,15 @@ def test_chains_of_another_posterior_are_refused_and_kept(chains: Path, change, 
 
 def test_another_shape_seed_or_file_is_refused(chains: Path, tmp_path: Path) -> None:
     problem = line_problem()
-    with pytest.raises(InputError, match="a chain of different input: walkers"):
+    with pytest.raises(InputError, match=r"other inputs \(its walkers"):
         sample(problem, chains, 7, LINE_START, dataclasses.replace(SHORT, walkers=18))
-    with pytest.raises(InputError, match="a chain of different input: seed"):
+    with pytest.raises(InputError, match=r"other inputs \(its seed"):
         sample(problem, chains, 0, LINE_START, SHORT)
     toy = toy_problem(surrogate=ToySurrogate())
-    with pytest.raises(InputError, match="a chain of a, b"):
+    with pytest.raises(InputError, match="this chain has the parameters a, b"):
         sample(toy, chains, 7, {**TRUTH, **NOISE}, dataclasses.replace(SHORT, walkers=24))
     (chains / "ensemble_0.h5").write_bytes(b"half a file")
-    with pytest.raises(InputError, match="not readable as HDF5"):
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
         sample(problem, chains, 7, LINE_START, SHORT)
     with pytest.raises(InputError, match="at least 12"):
         sample(problem, tmp_path / "new", 7, LINE_START, dataclasses.replace(SHORT, walkers=8))

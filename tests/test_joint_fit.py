@@ -56,9 +56,9 @@ def tangent(bench: DiagnosisContext, space: ParameterSpace = BASE) -> tuple[Tang
 def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: DiagnosisContext, first) -> None:
     space = ParameterSpace((first, *BASE.parameters[1:]))
     near, run = tangent(bench, space)
-    found = near.predict(run.theta)
-    np.testing.assert_allclose(found.mean[0], run.force_n, rtol=0, atol=1e-12)
-    assert not found.sd().any()
+    prediction = near.predict(run.theta)
+    np.testing.assert_allclose(prediction.mean[0], run.force_n, rtol=0, atol=1e-12)
+    assert not prediction.sd().any()
     unit, step = space.box.to_unit(run.theta), 1e-5
     for i in range(space.dim):
         ends = space.box.from_unit(unit + step * np.outer([-1.0, 1.0], np.eye(space.dim)[i]))
@@ -127,27 +127,29 @@ def highest(bench: DiagnosisContext) -> tuple[float, dict[str, float]]:
     rng = np.random.default_rng(0)
     truth = whole.vector({**start(bench), **TRUTH, "F0": -0.03, "stiffness_rate": -8e-4})
     starts = [truth, *(truth + 0.1 * rng.uniform(-1, 1, (6, len(low))) * (high - low))]
-    top = max((gauss_newton(whole, np.clip(x, low, high), None) for x in starts), key=lambda one: one.value)
+    top = max(
+        (gauss_newton(whole, np.clip(x, low, high), None) for x in starts), key=lambda optimum: optimum.value
+    )
     return top.value, whole.named(whole.from_sampling(top.vector))
 
 
 def test_a_fit_reaches_the_maximum_of_the_skin_itself(
     bench: DiagnosisContext, highest: tuple[float, dict[str, float]]
 ) -> None:
-    found = fit_set(SET, start(bench), bench.run, bench.posterior)
+    set_fit = fit_set(SET, start(bench), bench.run, bench.posterior)
     value, theta = highest
-    assert isinstance(found, SetFit)
-    assert found.settled
-    assert found.fit.names == SET
-    assert found.fit.value == pytest.approx(value, abs=2.0 * TrustSettings().enough)
-    deviations = np.sqrt(np.diag(found.fit.covariance))
-    low, high = found.fit.log_posterior.bounds
-    there = (found.fit.log_posterior.vector(theta) - low) / (high - low)
-    assert np.all(np.abs(found.fit.unit - there) < np.maximum(1.5 * deviations, 0.01))
-    assert found.fit.theta["F0"] == pytest.approx(-0.03, abs=2e-3)
-    np.testing.assert_allclose(found.fit.mean_n, found.fit.log_posterior.binned.force_n, atol=0.05)
-    at_run = [found.fit.theta[name] for name in found.fit.log_posterior.surrogate.space.names]
-    np.testing.assert_allclose(found.run.theta[:5], at_run[:5], rtol=1e-6)
+    assert isinstance(set_fit, SetFit)
+    assert set_fit.settled
+    assert set_fit.fit.names == SET
+    assert set_fit.fit.value == pytest.approx(value, abs=2.0 * TrustSettings().enough)
+    deviations = np.sqrt(np.diag(set_fit.fit.covariance))
+    low, high = set_fit.fit.log_posterior.bounds
+    there = (set_fit.fit.log_posterior.vector(theta) - low) / (high - low)
+    assert np.all(np.abs(set_fit.fit.unit - there) < np.maximum(1.5 * deviations, 0.01))
+    assert set_fit.fit.theta["F0"] == pytest.approx(-0.03, abs=2e-3)
+    np.testing.assert_allclose(set_fit.fit.mean_n, set_fit.fit.log_posterior.binned.force_n, atol=0.05)
+    at_run = [set_fit.fit.theta[name] for name in set_fit.fit.log_posterior.surrogate.space.names]
+    np.testing.assert_allclose(set_fit.run.theta[:5], at_run[:5], rtol=1e-6)
 
 
 def test_what_is_added_to_the_force_is_part_of_each_run(bench: DiagnosisContext) -> None:
@@ -156,15 +158,15 @@ def test_what_is_added_to_the_force_is_part_of_each_run(bench: DiagnosisContext)
     correction_n = 5e-3 * np.sin(np.arange(len(bench.binned.force_n)) / 7.0)
     binned = dataclasses.replace(bench.binned, force_n=bench.binned.force_n + correction_n)
     other = dataclasses.replace(bench, binned=binned)
-    found = fit_set(SET, start(bench), other.run, other.posterior, correction_n=correction_n)
+    set_fit = fit_set(SET, start(bench), other.run, other.posterior, correction_n=correction_n)
     assert isinstance(plain, SetFit)
-    assert isinstance(found, SetFit)
-    assert found.fit.value == pytest.approx(plain.fit.value, abs=0.2)
-    assert found.fit.theta["F0"] == pytest.approx(plain.fit.theta["F0"], abs=2e-4)
-    alone = bench.run(SET, found.fit.theta)
+    assert isinstance(set_fit, SetFit)
+    assert set_fit.fit.value == pytest.approx(plain.fit.value, abs=0.2)
+    assert set_fit.fit.theta["F0"] == pytest.approx(plain.fit.theta["F0"], abs=2e-4)
+    alone = bench.run(SET, set_fit.fit.theta)
     assert isinstance(alone, ModelRun)
-    np.testing.assert_allclose(found.run.force_n, alone.force_n + correction_n, atol=1e-6)
-    np.testing.assert_array_equal(found.correction_n, correction_n)
+    np.testing.assert_allclose(set_fit.run.force_n, alone.force_n + correction_n, atol=1e-6)
+    np.testing.assert_array_equal(set_fit.correction_n, correction_n)
     assert not plain.correction_n.any()
 
 
@@ -172,11 +174,11 @@ class Unsteady:
     """Runs of a bench, some of which fail."""
 
     def __init__(self, bench: DiagnosisContext, failing: Sequence[int]) -> None:
-        self.bench, self.failing, self.made = bench, failing, 0
+        self.bench, self.failing, self.count = bench, failing, 0
 
     def __call__(self, names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
-        self.made += 1
-        return "near folding" if self.made in self.failing else self.bench.run(names, theta)
+        self.count += 1
+        return "near folding" if self.count in self.failing else self.bench.run(names, theta)
 
 
 @pytest.mark.parametrize("failing", [(2,), (3,), (2, 4)])
@@ -184,24 +186,24 @@ def test_a_fit_goes_on_where_a_run_in_the_middle_fails(
     bench: DiagnosisContext, highest: tuple[float, dict[str, float]], failing: tuple[int, ...]
 ) -> None:
     skin = Unsteady(bench, failing)
-    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=14))
-    assert isinstance(found, SetFit)
-    assert found.runs == skin.made > max(failing)
-    assert found.settled
-    assert found.fit.value == pytest.approx(highest[0], abs=2.0 * TrustSettings().enough)
+    set_fit = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=14))
+    assert isinstance(set_fit, SetFit)
+    assert set_fit.runs == skin.count > max(failing)
+    assert set_fit.settled
+    assert set_fit.fit.value == pytest.approx(highest[0], abs=2.0 * TrustSettings().enough)
 
 
 def test_a_fit_whose_first_run_fails_is_its_message(bench: DiagnosisContext) -> None:
     skin = Unsteady(bench, (1,))
     assert fit_set(SET, start(bench), skin, bench.posterior) == "near folding"
-    assert skin.made == 1
+    assert skin.count == 1
 
 
 def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: DiagnosisContext) -> None:
-    found = fit_set(SET, start(bench), Unsteady(bench, range(2, 99)), bench.posterior)
-    assert isinstance(found, SetFit)
-    assert not found.settled
-    np.testing.assert_array_equal(found.run.theta[:5], [START[name] for name in BASE.names])
+    set_fit = fit_set(SET, start(bench), Unsteady(bench, range(2, 99)), bench.posterior)
+    assert isinstance(set_fit, SetFit)
+    assert not set_fit.settled
+    np.testing.assert_array_equal(set_fit.run.theta[:5], [START[name] for name in BASE.names])
 
 
 def test_a_fit_takes_shorter_steps_where_long_ones_fail(
@@ -219,11 +221,11 @@ def test_a_fit_takes_shorter_steps_where_long_ones_fail(
         last = moduli
         return bench.run(names, theta)
 
-    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=30))
-    assert isinstance(found, SetFit)
+    set_fit = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=30))
+    assert isinstance(set_fit, SetFit)
     assert failed
-    assert found.settled
-    assert found.fit.value == pytest.approx(highest[0], abs=2.0 * TrustSettings().enough)
+    assert set_fit.settled
+    assert set_fit.fit.value == pytest.approx(highest[0], abs=2.0 * TrustSettings().enough)
 
 
 @pytest.mark.parametrize("power", [1.0, POWER])
@@ -259,28 +261,28 @@ def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: Diagnos
         last = theta["k_s"]
         return bench.run(names, theta)
 
-    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=4))
-    assert isinstance(found, SetFit)
+    set_fit = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=4))
+    assert isinstance(set_fit, SetFit)
     assert failed
-    stiffness = [2e-6 * theta["E_c"] + 4e-6 * theta["E_s"] for theta in (found.fit.theta, TRUTH, START)]
+    stiffness = [2e-6 * theta["E_c"] + 4e-6 * theta["E_s"] for theta in (set_fit.fit.theta, TRUTH, START)]
     assert stiffness[0] == pytest.approx(stiffness[1], rel=0.05)  # moduli have gone all the way meanwhile
     assert stiffness[2] != pytest.approx(stiffness[1], rel=0.1)
 
 
 def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: DiagnosisContext) -> None:
-    made: list[ModelRun] = []
+    runs: list[ModelRun] = []
 
     def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
         """Whose third run pulls ten times as hard as the second's slopes say."""
         run = bench.run(names, theta)
         assert isinstance(run, ModelRun)
-        made.append(dataclasses.replace(run, force_n=(10.0 if len(made) == 2 else 1.0) * run.force_n))
-        return made[-1]
+        runs.append(dataclasses.replace(run, force_n=(10.0 if len(runs) == 2 else 1.0) * run.force_n))
+        return runs[-1]
 
-    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=3))
-    assert isinstance(found, SetFit)
-    assert len(made) == found.runs == 3
-    assert found.run is made[1]
+    set_fit = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=3))
+    assert isinstance(set_fit, SetFit)
+    assert len(runs) == set_fit.runs == 3
+    assert set_fit.run is runs[1]
 
 
 @pytest.mark.parametrize("runs", [1, 2, 3, 5])
@@ -290,10 +292,10 @@ def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(
     values = []
     for most in (runs, runs + 1):
         skin = Unsteady(bench, ())
-        found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=most))
-        assert isinstance(found, SetFit)
-        assert skin.made == found.runs <= most
-        values.append(found.fit.value)
+        set_fit = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=most))
+        assert isinstance(set_fit, SetFit)
+        assert skin.count == set_fit.runs <= most
+        values.append(set_fit.fit.value)
     assert values[1] >= values[0] - 1e-9
 
 
@@ -341,9 +343,9 @@ def test_what_lies_in_series_goes_by_its_shortcut_where_a_surrogate_is_the_skin(
     assert bench.space(names).names == skin.space.names
     values = {"recovery_compliance": 1e-3, "recovery_time": 20.0}
     task = FitTask(names, {**bench.noise, **SKIN, **values}, 4)
-    found = read_answer(bench, task, answer(bench, task))
-    assert isinstance(found, SetFit)
-    assert set(values) <= set(found.fit.theta)
-    plain = bench.reported(names, {**found.fit.theta, "recovery_compliance": 0.0})
-    slower = bench.reported(names, {**found.fit.theta, **values})
+    set_fit = read_answer(bench, task, answer(bench, task))
+    assert isinstance(set_fit, SetFit)
+    assert set(values) <= set(set_fit.fit.theta)
+    plain = bench.reported(names, {**set_fit.fit.theta, "recovery_compliance": 0.0})
+    slower = bench.reported(names, {**set_fit.fit.theta, **values})
     assert np.abs(np.asarray(slower) - np.asarray(plain)).max() > 1e-3

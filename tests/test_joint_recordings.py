@@ -237,6 +237,12 @@ def test_two_recordings_of_one_skin_agree_and_narrow_its_parameters(monkeypatch:
     start = {**context.neutral, **TRUTH, **context.alone[0].noise}
     (alone,) = asked(context, [FitTask((), start, 9, recording=0)])
     assert isinstance(alone, SetFit)
+    for name, sd in rows[0].sd_alone.items():
+        column = alone.fit.log_posterior.names.index(name)
+        assert sd == pytest.approx(np.sqrt(12.0 * alone.fit.covariance[column, column]), rel=0.3)
+        # Two recordings of the same protocol, with the same noise, say the same about the skin.
+        assert rows[0].widens[name] == pytest.approx(rows[1].widens[name], rel=0.2)
+    assert max(rows[0].widens.values()) == pytest.approx(np.sqrt(2.0), rel=0.1)
     # The error of the load cell's calibration is common to both, so the moduli gain less.
     for name in ("k_c", "k_s"):
         column = fit.fit.log_posterior.names.index(name)

@@ -77,7 +77,9 @@ BELOW = {
 }
 BELOW["workflow"] |= {"proof"}
 BELOW["scripting"] = BELOW["workflow"] | {"workflow"}
-BELOW["cli"] = BELOW["workflow"] | {"workflow"}
+BELOW["app"] = BELOW["workflow"] | {"workflow"}
+BELOW["cli"] = BELOW["workflow"] | {"workflow", "app"}
+BELOW["__main__"] = {"cli"}
 
 
 def imported(source: str, module: tuple[str, ...], is_package: bool) -> Iterator[str]:

@@ -89,21 +89,21 @@ def test_any_two_run_together_row_by_row_and_in_any_order(pair):
         together, observed([ALL[n] for n in reversed(pair)], values, MOTION, skin)(TIMES_S)
     )
     for i in range(4):
-        one = {name: column[i : i + 1] for name, column in values.items()}
-        alone = observed([ALL[n] for n in pair], one, MOTION, skin)(TIMES_S)
+        row = {name: column[i : i + 1] for name, column in values.items()}
+        alone = observed([ALL[n] for n in pair], row, MOTION, skin)(TIMES_S)
         np.testing.assert_allclose(alone[0], together[i], rtol=1e-12, atol=1e-15)
 
 
 def test_friction_makes_a_loop_of_twice_its_sliding_value_and_holds_keep_it():
     """Dahl's loop: after a presliding length or ten, the branch of each direction lies Fc from the middle."""
-    found = reported("device-friction", Fc=0.05, presliding=2e-5, friction_start=0.0)
-    up = found[(TIMES_S > 8) & (TIMES_S < 14)]
-    down = found[(TIMES_S > 48) & (TIMES_S < 54)]
+    force_n = reported("device-friction", Fc=0.05, presliding=2e-5, friction_start=0.0)
+    up = force_n[(TIMES_S > 8) & (TIMES_S < 14)]
+    down = force_n[(TIMES_S > 48) & (TIMES_S < 54)]
     np.testing.assert_allclose(up, 0.05, rtol=1e-6)
     np.testing.assert_allclose(down, -0.05, rtol=1e-6)
-    held = found[(TIMES_S > 14.5) & (TIMES_S < 44.9)]
+    held = force_n[(TIMES_S > 14.5) & (TIMES_S < 44.9)]
     np.testing.assert_allclose(held, 0.05, rtol=1e-6)
-    np.testing.assert_allclose(found[TIMES_S < 5], 0.0, atol=1e-15)
+    np.testing.assert_allclose(force_n[TIMES_S < 5], 0.0, atol=1e-15)
 
 
 @settings(max_examples=25, deadline=None)
@@ -114,7 +114,7 @@ def test_friction_makes_a_loop_of_twice_its_sliding_value_and_holds_keep_it():
     st.floats(3.0, 1000.0),
 )
 def test_friction_and_its_creep_solve_their_equation(sliding, length, start, tau):
-    found = reported(
+    force_n = reported(
         "device-friction", "friction-creep",
         Fc=sliding, presliding=length, friction_start=start, friction_tau=tau,
     )  # fmt: skip
@@ -132,22 +132,22 @@ def test_friction_and_its_creep_solve_their_equation(sliding, length, start, tau
         )  # fmt: skip
         expected += list(solved.y[0][: len(at)])
         force = solved.y[0][-1]
-    np.testing.assert_allclose(found[: len(expected)], expected, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(force_n[: len(expected)], expected, rtol=0, atol=2e-6)
 
 
 def test_drag_is_proportional_to_the_speed():
-    found = reported("viscous-drag", drag=20.0)
-    np.testing.assert_allclose(found, 20.0 * np.gradient(MOTION.at(TIMES_S), TIMES_S), atol=0.011)
-    assert found[100] == pytest.approx(0.02)
-    assert found[300] == 0.0
+    force_n = reported("viscous-drag", drag=20.0)
+    np.testing.assert_allclose(force_n, 20.0 * np.gradient(MOTION.at(TIMES_S), TIMES_S), atol=0.011)
+    assert force_n[100] == pytest.approx(0.02)
+    assert force_n[300] == 0.0
 
 
 def test_ripple_repeats_with_the_position_and_only_while_moving():
-    found = reported("position-ripple", ripple_period=4e-4, ripple_amplitude=0.01, ripple_phase=0.3)
+    force_n = reported("position-ripple", ripple_period=4e-4, ripple_amplitude=0.01, ripple_phase=0.3)
     moving = (TIMES_S > 5) & (TIMES_S < 14.4)
     expected = 0.01 * np.sin(2 * np.pi * MOTION.at(TIMES_S) / 4e-4 + 0.3)
-    np.testing.assert_allclose(found[moving], expected[moving], atol=1e-15)
-    assert np.all(found[(TIMES_S > 14.5) & (TIMES_S < 44)] == 0.0)
+    np.testing.assert_allclose(force_n[moving], expected[moving], atol=1e-15)
+    assert np.all(force_n[(TIMES_S > 14.5) & (TIMES_S < 44)] == 0.0)
 
 
 @pytest.mark.parametrize("period", [1e-4, 1.7e-4, 3.1e-4, 1e-3])
@@ -157,10 +157,10 @@ def test_bins_mean_a_ripple_over_all_its_cycles(period):
     edges_s = np.arange(5.0, 15.0)
     values = values_of("position-ripple", **chosen)
     force = observed([ALL["position-ripple"]], values, MOTION, nothing)
-    found = bin_means(force, MOTION, edges_s, [ALL["position-ripple"]])[0]
+    means_n = bin_means(force, MOTION, edges_s, [ALL["position-ripple"]])[0]
     phase = 2 * np.pi * MOTION.at(edges_s) / period + 0.3
     expected = -0.01 * np.diff(np.cos(phase)) / np.diff(phase)
-    np.testing.assert_allclose(found, expected, atol=2e-5)
+    np.testing.assert_allclose(means_n, expected, atol=2e-5)
 
 
 def test_a_delayed_force_is_that_of_before():
@@ -203,16 +203,16 @@ def test_a_jump_passes_a_lagging_amplifier_exponentially_and_bins_mean_that(tau)
 
 def test_the_amplifier_smooths_steps_of_the_cell_s_zero():
     after_s = np.array([0.3, 0.8])
-    found = reported(
+    force_n = reported(
         "amplifier-lag", "sensor-events", time_s=65.0 + after_s,
         amplifier_time=0.5, event_1_at=0.5, event_1_step=0.03, event_2_step=0.0,
     ) - reported("amplifier-lag", time_s=65.0 + after_s, amplifier_time=0.5)  # fmt: skip
-    np.testing.assert_allclose(found, -0.03 * np.expm1(-after_s / 0.5), atol=1e-6)
+    np.testing.assert_allclose(force_n, -0.03 * np.expm1(-after_s / 0.5), atol=1e-6)
 
 
 def test_a_bent_cell_adds_the_square_of_the_force_that_acts_on_it():
-    found = reported("cell-nonlinearity", "force-offset", cell_bend=-0.3, F0=0.04)
-    np.testing.assert_allclose(found, 0.04 - 0.3 * skin(TIMES_S)[0] ** 2, atol=1e-15)
+    force_n = reported("cell-nonlinearity", "force-offset", cell_bend=-0.3, F0=0.04)
+    np.testing.assert_allclose(force_n, 0.04 - 0.3 * skin(TIMES_S)[0] ** 2, atol=1e-15)
     force = observed([ALL["cell-nonlinearity"]], {"cell_bend": np.array([0.4])}, MOTION, straight)
     edges_s = np.arange(5.0, 14.0)
     ends = straight(edges_s)[0]
@@ -262,8 +262,10 @@ def test_events_are_refuted_where_samples_show_no_step():
 
 
 def test_events_and_drift_add_what_they_say():
-    found = reported("sensor-events", event_1_at=0.25, event_1_step=0.03, event_2_at=0.5, event_2_step=-0.01)
-    np.testing.assert_allclose(found[[324, 326, 649, 651]], [0.0, 0.03, 0.03, 0.02], atol=1e-15)
+    force_n = reported(
+        "sensor-events", event_1_at=0.25, event_1_step=0.03, event_2_at=0.5, event_2_step=-0.01
+    )
+    np.testing.assert_allclose(force_n[[324, 326, 649, 651]], [0.0, 0.03, 0.03, 0.02], atol=1e-15)
     np.testing.assert_allclose(reported("sensor-drift", drift=1e-4), 1e-4 * TIMES_S)
     np.testing.assert_allclose(reported("force-offset", F0=-0.02), -0.02)
 
@@ -336,15 +338,15 @@ def test_another_package_adds_a_mechanism(plugin):
 
 def test_a_need_of_what_there_is_not_is_refused(plugin):
     plugin("magnet", "pull", "needs=('iron',),")
-    with pytest.raises(InputError, match="magnet: found a need of iron"):
+    with pytest.raises(InputError, match="magnet: it needs iron"):
         catalogue()
 
 
 @pytest.mark.parametrize(
     ("name", "parameter", "message"),
     [
-        ("force-offset", "pull", "found force-offset twice"),
-        ("magnet", "F0", "found a parameter F0 in force-offset and magnet"),
+        ("force-offset", "pull", "the name force-offset"),
+        ("magnet", "F0", "force-offset and magnet have a parameter F0"),
     ],
 )
 def test_two_of_one_name_are_refused(plugin, name, parameter, message):
@@ -359,16 +361,19 @@ def test_a_parameter_without_a_neutral_value_gets_the_median_of_its_prior(plugin
 
 
 @pytest.mark.parametrize(
-    ("made", "message"),
+    ("changes", "message"),
     [
-        ({"neutral": "pul"}, "magnet: found a neutral value of pul; expected of at least one .* pull, rust"),
-        ({"lower": 0.0}, "magnet: rust: found log-uniform from 0 to 1; expected a lower bound"),
-        ({"lower": 2.0}, "magnet: rust: found log-uniform from 2 to 1; expected a lower bound"),
-        ({"more": "coil=3"}, "entry point magnet = magnet:MECHANISM: found TypeError.*import magnet"),
-        ({"more": "); MECHANISM = dict("}, "magnet:MECHANISM: found an object of the type dict"),
+        ({"neutral": "pul"}, "magnet: `neutral` names pul; it must name at least one .* pull, rust"),
+        ({"lower": 0.0}, "magnet: rust: its prior is log-uniform from 0 to 1; the lower bound"),
+        ({"lower": 2.0}, "magnet: rust: its prior is log-uniform from 2 to 1; the lower bound"),
+        (
+            {"more": "coil=3"},
+            r"entry point magnet = magnet:MECHANISM: it cannot be imported \(TypeError.*import magnet",
+        ),
+        ({"more": "); MECHANISM = dict("}, "magnet:MECHANISM: it is an object of the type dict"),
     ],
 )
-def test_a_mechanism_of_another_package_that_cannot_work_is_refused_in_one_line(plugin, made, message):
-    plugin("magnet", "pull", **made)
+def test_a_mechanism_of_another_package_that_cannot_work_is_refused_in_one_line(plugin, changes, message):
+    plugin("magnet", "pull", **changes)
     with pytest.raises(InputError, match=message):
         catalogue()

@@ -32,7 +32,7 @@ from bayeskin.types import Jumps, ParameterSpace
 KNOWN = {
     name: catalogue()[name] for name in ("force-offset", "sensor-drift", "viscous-drag", "sensor-events")
 }
-NEUTRAL = {name: value for one in KNOWN.values() for name, value in one.neutral.items()}
+NEUTRAL = {name: value for mechanism in KNOWN.values() for name, value in mechanism.neutral.items()}
 QUIET = NoisePriors(sd_n=(1e-4, 6e-3), tau_s=(0.1, 5.0), nu=(4.0, 100.0))
 
 

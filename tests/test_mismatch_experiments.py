@@ -212,7 +212,7 @@ def test_the_figure_shows_every_protocol_that_could_be_judged() -> None:
     table = judged(fits)
     figure = figure_experiments((*table, dataclasses.replace(table[0], gain_bits=np.nan)))
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
-        one.protocol.name for one in reversed(table)
+        experiment.protocol.name for experiment in reversed(table)
     ]
     assert "five times faster" in figure.get_suptitle().lower() or "quarter" in figure.get_suptitle().lower()
     assert "None" in figure_experiments(()).get_suptitle()
@@ -235,22 +235,26 @@ def test_changes_of_the_most_telling_tests_are_judged_and_tell_more() -> None:
     """Drag and friction of one speed differ by speed alone; here no test to begin with has another."""
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     others = ("quarter speed", "five times faster")
-    first = [one for one in variations(closed_form_model.MOTION, LIMITS) if one.name not in others]
+    first = [
+        protocol for protocol in variations(closed_form_model.MOTION, LIMITS) if protocol.name not in others
+    ]
     weighed: dict[bytes, Experiment] = {}
 
-    def weigh_once(one: Protocol) -> Experiment:
-        key = one.motion.time_s.tobytes() + one.motion.displacement_m.tobytes()
+    def weigh_once(protocol: Protocol) -> Experiment:
+        key = protocol.motion.time_s.tobytes() + protocol.motion.displacement_m.tobytes()
         if key not in weighed:
-            weighed[key] = weigh(one, fits, KNOWN, asked, 0)
+            weighed[key] = weigh(protocol, fits, KNOWN, asked, 0)
         return weighed[key]
 
     experiments = search(weigh_once, first, LIMITS, 1)
-    listed = [one for one in experiments if one.protocol in first]
+    listed = [experiment for experiment in experiments if experiment.protocol in first]
     assert experiments[0].protocol not in first
     assert experiments[0].gain_bits > listed[0].gain_bits + 0.1
     again = search(weigh_once, first, LIMITS, 1)
-    assert [one.protocol for one in again] == [one.protocol for one in experiments]
-    sure = search(lambda one: Experiment(one, 1.0, 0.0, 1.0, 1.0, 0), first, LIMITS, 1)
+    assert [experiment.protocol for experiment in again] == [
+        experiment.protocol for experiment in experiments
+    ]
+    sure = search(lambda protocol: Experiment(protocol, 1.0, 0.0, 1.0, 1.0, 0), first, LIMITS, 1)
     assert len(sure) == len(first)
 
 
@@ -298,7 +302,7 @@ def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
     np.testing.assert_allclose(near, NOISE["sd_hold"] ** 2 * np.exp(-1.0 / NOISE["tau_noise"]) + 0.2e-6)
 
 
-def made(fits: Sequence[Fit]) -> Any:
+def search_with(fits: Sequence[Fit]) -> Any:
     """A search that has made these fits."""
     return SimpleNamespace(fits={fit.names: SimpleNamespace(fit=fit) for fit in fits})
 
@@ -313,7 +317,7 @@ class Asked:
 
 @pytest.fixture
 def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
-    """A run whose diagnosis has been made, and found that something rubs."""
+    """A run whose diagnosis is complete, with the verdict that something rubs."""
     (tmp_path / "x.toml").write_text('[recording]\nfile = "x.h5"\n')
     record = Record("inputs", True, 1.0, {"diagnosis.json": "00"})
     (tmp_path / "x" / "diagnose").mkdir(parents=True)
@@ -342,7 +346,7 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
 def test_nothing_competes_with_the_only_set_that_was_tried(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(experiment, "searched", lambda *_: made([fitted("rub", rubbing=4e-3)]))
+    monkeypatch.setattr(experiment, "searched", lambda *_: search_with([fitted("rub", rubbing=4e-3)]))
     answer = experiment.choose([diagnosed.source], Silent())
     assert (answer["ok"], answer["sets"]) == (True, [["rub"]])
     assert "nothing competes" in answer["text"]
@@ -352,8 +356,8 @@ def test_nothing_competes_with_the_only_set_that_was_tried(
 def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(experiment, "searched", lambda *_: made([]))
-    with pytest.raises(InputError, match="no fit of rub; expected the fits that `bayeskin diagnose` stores"):
+    monkeypatch.setattr(experiment, "searched", lambda *_: search_with([]))
+    with pytest.raises(InputError, match="no fit of rub; remove the run's folder `diagnose`"):
         experiment.choose([diagnosed.source], Silent())
     failed = {"ok": False, "message": "too few runs", "text": "design: failed: too few runs"}
     monkeypatch.setattr(diagnosis, "diagnose", lambda *_: failed)
@@ -364,7 +368,7 @@ def test_the_test_to_run_next_is_written_for_the_machine(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    monkeypatch.setattr(experiment, "searched", lambda *_: made(fits))
+    monkeypatch.setattr(experiment, "searched", lambda *_: search_with(fits))
     answer = experiment.choose([diagnosed.source], Silent())
     best = answer["experiments"][0]
     words = answer["text"].splitlines()
@@ -380,7 +384,7 @@ def test_tests_whose_processes_are_lost_are_said_to_be_unjudged(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    monkeypatch.setattr(experiment, "searched", lambda *_: made(fits))
+    monkeypatch.setattr(experiment, "searched", lambda *_: search_with(fits))
     monkeypatch.setattr(
         experiment, "asked", lambda *_: nullcontext(lambda tasks: ["the process was lost"] * len(tasks))
     )

@@ -109,7 +109,7 @@ def test_a_discrepancy_is_found_in_noise_with_a_memory(extra: Extra, memory_s: f
 def test_noise_is_seldom_noticed_or_given_a_form() -> None:
     """Among 200 recordings of noise, alarms are as frequent as their stated levels of 1 % and 5 %."""
     fits = [known_fit(seed) for seed in range(200)]
-    assert sum(discrepancy(one, closed_form_model.MOTION).noticeable for one in fits) <= 6
+    assert sum(discrepancy(fit, closed_form_model.MOTION).noticeable for fit in fits) <= 6
     forms = [propose_form(fit, closed_form_model.MOTION, seed) for seed, fit in enumerate(fits)]
     assert sum(form.terms != () for form in forms) <= 20
 
@@ -240,11 +240,11 @@ def test_what_looks_like_a_parameter_does_not_change_the_discrepancy(parameter: 
     binned = fit.log_posterior.binned
     shifted = dataclasses.replace(binned, force_n=binned.force_n + 0.02 * slope)
     other = dataclasses.replace(fit, log_posterior=dataclasses.replace(fit.log_posterior, binned=shifted))
-    one, two = discrepancy(fit, closed_form_model.MOTION), discrepancy(other, closed_form_model.MOTION)
-    assert np.linalg.norm(two.taken_n - one.taken_n) > 1e-5
+    first, second = discrepancy(fit, closed_form_model.MOTION), discrepancy(other, closed_form_model.MOTION)
+    assert np.linalg.norm(second.taken_n - first.taken_n) > 1e-5
     # As far as climbs to the hyperparameters end alike: a micronewton is a thousandth of the noise.
-    np.testing.assert_allclose(two.mean_n, one.mean_n, atol=1e-6)
-    np.testing.assert_allclose(two.sd_n, one.sd_n, atol=1e-6)
+    np.testing.assert_allclose(second.mean_n, first.mean_n, atol=1e-6)
+    np.testing.assert_allclose(second.sd_n, first.sd_n, atol=1e-6)
 
 
 def test_a_parameter_at_its_bound_takes_up_nothing() -> None:
@@ -337,9 +337,12 @@ def test_the_share_left_out_is_that_of_fits_without_each_phase() -> None:
 
 def test_the_same_seed_gives_the_same_form() -> None:
     fit = known_fit(4, drifting)
-    one, two = propose_form(fit, closed_form_model.MOTION, 7), propose_form(fit, closed_form_model.MOTION, 7)
-    assert one.sentence == two.sentence
-    np.testing.assert_array_equal(one.force_n, two.force_n)
+    first, second = (
+        propose_form(fit, closed_form_model.MOTION, 7),
+        propose_form(fit, closed_form_model.MOTION, 7),
+    )
+    assert first.sentence == second.sentence
+    np.testing.assert_array_equal(first.force_n, second.force_n)
 
 
 def test_memory_of_a_ramp_and_hold_is_the_closed_form() -> None:

@@ -117,16 +117,16 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 def test_nothing_is_written_over(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = own.with_suffix(".toml")
     out.write_text("mine")
-    assert "own.toml: found a file that exists already" in refused(capsys, "new", own)
+    assert "own.toml: this file exists already" in refused(capsys, "new", own)
     assert out.read_text() == "mine"
 
 
 def test_what_cannot_be_done_is_refused_in_one_line_and_nothing_written(
     own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "ending .toml" in refused(capsys, "new", own, "-o", tmp_path / "own.yaml")
+    assert "use .toml" in refused(capsys, "new", own, "-o", tmp_path / "own.yaml")
     assert "no such file" in refused(capsys, "new", tmp_path / "absent.csv")
-    assert ".: found a folder; expected a recording" in refused(capsys, "new", Path())
+    assert ".: it is a folder; bayeskin needs a recording" in refused(capsys, "new", Path())
     assert [path.name for path in tmp_path.iterdir()] == ["own.h5"]
 
 
@@ -177,7 +177,7 @@ def test_a_surrogate_that_is_nowhere_is_told_apart_from_a_broken_installation(tm
     shutil.copy(shipped("data/demo.h5"), tmp_path / "a.h5")
     case = tmp_path / "case.toml"
     case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
-    with pytest.raises(InputError, match=r"surrogate.file: found no file .*mine.h5; expected .*: demo.h5, "):
+    with pytest.raises(InputError, match=r"surrogate.file: there is no file .*mine.h5; .*: demo.h5, "):
         shipped_files(open_run(case, Silent()))
 
 
@@ -185,15 +185,15 @@ def test_a_window_without_a_bin_is_refused_before_anything_is_run(own: Path) -> 
     new_config([own])
     case = own.with_suffix(".toml")
     case.write_text(case.read_text() + "\n[fit]\nwindows_s = [[0.0, 20.0], [60.2, 90.0]]\n")
-    with pytest.raises(InputError, match=r"fit.windows_s: found \[60.2, 90\]; expected .*, 0 to 59.5 s"):
+    with pytest.raises(InputError, match=r"fit.windows_s: the window \[60.2, 90\] .* 0 to 59.5 s"):
         stages.run(case, "recording", Silent())
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"waves": None}, "manifest: waves: found None"),
-        ({"parameters": {}}, "manifest: parameters: found other parameters"),
+        ({"waves": None}, "manifest: waves: it is None"),
+        ({"parameters": {}}, "manifest: parameters: they differ"),
     ],
     ids=["no waves", "no box"],
 )

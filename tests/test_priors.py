@@ -179,14 +179,14 @@ def test_a_configuration_states_a_joint_prior(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("E_x = 0.5", "correlations: found 'E_x'; expected two parameters with normal or log-normal priors"),
-        ("k_c = 0.5", "found k_c, whose prior is not normal; expected two parameters with normal"),
-        ("E_s = 1.0", "correlations: E_c and E_s: found 1; expected two different parameters"),
-        ("E_c = 0.5", "found 0.5; expected two different parameters"),
-        ('E_s = "much"', 'E_c.correlations.E_s: found "much"; expected a valid number'),
+        ("E_x = 0.5", "correlations: 'E_x' is not known; both parameters need normal or log-normal priors"),
+        ("k_c = 0.5", "the prior of k_c is not normal; both parameters need normal"),
+        ("E_s = 1.0", "correlations: E_c and E_s: the value is 1; two different parameters"),
+        ("E_c = 0.5", "the value is 0.5; two different parameters"),
+        ('E_s = "much"', 'E_c.correlations.E_s: "much" is not allowed; it must be a valid number'),
         (
             "E_s = 0.5\n[parameters.E_s.correlations]\nE_c = 0.5",
-            "E_s and E_c: found two values; expected one",
+            "E_s and E_c: two values are given; give one",
         ),
     ],
 )
@@ -199,7 +199,7 @@ def test_a_joint_prior_that_cannot_be_is_refused(tmp_path: Path, text: str, says
 def test_correlations_that_cannot_hold_together_are_refused():
     three = [Parameter(name, "Pa", -9.0, 9.0, "normal") for name in "abc"]
     pairs = (Correlation("a", "b", 0.9), Correlation("b", "c", 0.9), Correlation("a", "c", -0.9))
-    with pytest.raises(InputError, match="correlations that form a positive definite matrix"):
+    with pytest.raises(InputError, match="must be positive definite"):
         ParameterSpace(tuple(three), pairs)
 
 
@@ -213,10 +213,19 @@ def test_a_configuration_states_a_prior_and_its_source(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('prior = "normal"\nmean = 1e5', "prior: found mean; expected mean and sd"),
-        ('prior = "log-normal"', "prior: found none of its numbers; expected factor and median"),
-        ("mean = 1e5\nsd = 1e4", "prior: found mean, sd; expected them only with a normal prior"),
-        ('prior = "normal"\nmean = 5e6\nsd = 1e4', "a prior centred at 5e+06 Pa; expected 10000 to 2e+06"),
+        ('prior = "normal"\nmean = 1e5', "prior: a normal prior is given with mean; it needs mean and sd"),
+        (
+            'prior = "log-normal"',
+            "prior: a log-normal prior is given with no number; it needs factor and median",
+        ),
+        (
+            "mean = 1e5\nsd = 1e4",
+            "prior: a default prior is given with mean, sd; only a normal or log-normal prior",
+        ),
+        (
+            'prior = "normal"\nmean = 5e6\nsd = 1e4',
+            "centred at 5e+06 Pa; the centre must lie within the bounds, 10000 to 2e+06",
+        ),
     ],
 )
 def test_a_prior_without_its_numbers_is_refused(tmp_path: Path, text: str, says: str):

@@ -71,7 +71,7 @@ def test_a_set_of_what_was_asked_for_has_each_as_often_with_sizes_even_in_logari
     assert len({p.numbers for p in drawn}) == 18
     assert sum(p.tetrahedra for p in drawn) == 7
     assert draw(of["friction-creep"][0], 0, SKIN).target == of["friction-creep"][0].target
-    with pytest.raises(InputError, match=r"--only: found pad-slop; expected nothing, or one of backlash"):
+    with pytest.raises(InputError, match=r"--only: pad-slop is not known; use one of nothing, backlash"):
         plans(3, 18, ["pad-slop"])
 
 

@@ -65,11 +65,15 @@ def test_spikes_are_upward_and_in_holds_above_all() -> None:
 
 
 def test_nothing_in_a_recording_tells_what_it_conceals(concealed_set: Path) -> None:
-    found = [
+    recordings = [
         storage.load(seals.recording_path(concealed_set, f"{i + 1:03d}"), Recording) for i in range(COUNT)
     ]
-    assert {one.name for one in found} == {"recording"}
-    assert len({one.notes for one in found}) == len({one.time_s.tobytes() for one in found}) == 1
+    assert {recording.name for recording in recordings} == {"recording"}
+    assert (
+        len({recording.notes for recording in recordings})
+        == len({recording.time_s.tobytes() for recording in recordings})
+        == 1
+    )
     words = {*catalogue(), *OUTSIDE, "theta", "nothing", "outside"}
     for path in (concealed_set / "recordings").iterdir():
         assert not any(word.encode() in path.read_bytes() for word in words)
@@ -104,17 +108,15 @@ def test_what_was_missing_of_a_set_is_made_in_any_order_by_processes(
     assert told == [(0.75, "3 of 4"), (1.0, "4 of 4")]
     assert seals.read_keys(copy) == seals.read_keys(concealed_set)
     for number in ("002", "004"):
-        again, first = (seals.recording_path(one, number).read_bytes() for one in (copy, concealed_set))
+        again, first = (seals.recording_path(folder, number).read_bytes() for folder in (copy, concealed_set))
         assert again == first
 
 
 def test_a_case_that_cannot_be_made_is_told_and_those_before_it_are_kept(tmp_path: Path) -> None:
     def fails_later(plan: Plan) -> Concealed | tuple[str, str, str]:
-        return (
-            quickly(plan) if plan.numbers[-1] < 2 else ("proof: x", "8 runs that failed", "one that succeeds")
-        )
+        return quickly(plan) if plan.numbers[-1] < 2 else ("proof: x", "8 runs failed", "use another seed")
 
-    with pytest.raises(InputError, match="proof: x: found 8 runs that failed; expected one that succeeds"):
+    with pytest.raises(InputError, match="proof: x: 8 runs failed; use another seed"):
         conceal(tmp_path, SEED, COUNT, make=fails_later, run_all=one_by_one)
     assert list(seals.read_index(tmp_path)) == ["001", "002"]
 
@@ -124,13 +126,13 @@ def test_a_run_that_fails_is_drawn_anew() -> None:
 
     def fails_first(case: Case, names, change: Change) -> Simulation:
         tried.append(case)
-        found = quick_run(case, names, change)
-        return replace(found, status="failed") if len(tried) == 1 else found
+        run = quick_run(case, names, change)
+        return replace(run, status="failed") if len(tried) == 1 else run
 
-    one = concealed(Plan("nothing", "nothing", (), "", False, (9, 1, 0)), SKIN, fails_first)
-    assert one.key["attempt"] == 1
-    assert one.key["theta"] == tried[-1].theta != tried[0].theta
-    assert one.key["size"] < 1e-6
+    recording = concealed(Plan("nothing", "nothing", (), "", False, (9, 1, 0)), SKIN, fails_first)
+    assert recording.key["attempt"] == 1
+    assert recording.key["theta"] == tried[-1].theta != tried[0].theta
+    assert recording.key["size"] < 1e-6
 
 
 def test_the_screen_adds_what_mechanisms_change_and_marks_a_run_that_fails() -> None:

@@ -26,7 +26,7 @@ def test_a_key_or_a_recording_that_was_changed_shows(concealed_set: Path, tmp_pa
     copy = Path(shutil.copytree(concealed_set, tmp_path / "copy"))
     path = copy / "seals" / "002.json"
     path.write_text(path.read_text().replace('"floor_n"', '"floor_N"'))
-    with pytest.raises(InputError, match=r"002\.json: found other contents"):
+    with pytest.raises(InputError, match=r"002\.json: its contents differ"):
         seals.read_keys(copy)
 
 

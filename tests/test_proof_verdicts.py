@@ -47,20 +47,20 @@ def test_a_diagnosis_that_fails_ends_no_set(concealed_set: Path, tmp_path: Path)
     copy = Path(shutil.copytree(concealed_set, tmp_path / "copy"))
     board = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]
     assert (len(seen), board["judged"]) == (COUNT, COUNT)
-    assert [one["answer"] for one in board["each"]][:3] == ["failed", "failed", "failed"]
+    assert [verdict["answer"] for verdict in board["each"]][:3] == ["failed", "failed", "failed"]
     again = pipeline.prove(copy, Silent(), diagnose=fails)[
         "scoreboard"
     ]  # those three once more, and no other
     assert len(seen) == COUNT + 3
-    assert "failed" not in [one["answer"] for one in again["each"]]
+    assert "failed" not in [verdict["answer"] for verdict in again["each"]]
 
 
 def test_a_set_is_worked_on_by_one_process(concealed_set: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(concealed_set, tmp_path / "set"))
     with locked(copy):
-        with pytest.raises(InputError, match=r"in use by another bayeskin \(process \d+\)"):
+        with pytest.raises(InputError, match=r"another bayeskin \(process \d+\)"):
             pipeline.prove(copy, Silent(), diagnose=nothing_found)
-        with pytest.raises(InputError, match="in use by another bayeskin"):
+        with pytest.raises(InputError, match="another bayeskin"):
             pipeline.conceal(copy, SEED, COUNT, Silent())
     assert pipeline.prove(copy, Silent(), diagnose=nothing_found)["scoreboard"]["judged"] == COUNT
     with locked(copy):  # nothing is left to be diagnosed, and a score takes no turns

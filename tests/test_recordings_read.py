@@ -146,7 +146,7 @@ def test_units_may_stand_in_a_row_of_their_own_below_a_preamble(tmp_path: Path) 
 
 def test_a_unit_left_out_is_asked_for(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", [["time (s)", "disp", "force"], *ROWS])
-    said = r"columns 'disp', 'force' without a known unit; .* --unit displacement=UNIT --unit force=UNIT"
+    said = r"the unit of 'disp', 'force' is not known; .* --unit displacement=UNIT --unit force=UNIT"
     with pytest.raises(InputError, match=said):
         read_recording(path)
     units = {"displacement": stated_unit("displacement", "mm"), "force": stated_unit("force", "N")}
@@ -174,10 +174,10 @@ def test_workbooks_are_read_from_the_one_sheet_with_the_columns(tmp_path: Path) 
     path = workbook(tmp_path / "a.xlsx", Notes=[["hello"]], Test=[HEADER, *NUMBERS])
     assert_is_the_test(read_recording(path))
     both = workbook(tmp_path / "b.xlsx", A=[HEADER, *NUMBERS], B=[HEADER, *NUMBERS])
-    with pytest.raises(InputError, match=r"2 of the tables \['A', 'B'\]; expected .*--sheet"):
+    with pytest.raises(InputError, match=r"2 of its tables 'A', 'B' .*--sheet"):
         read_recording(both)
     assert_is_the_test(read_recording(both, sheet="B"))
-    with pytest.raises(InputError, match="a sheet 'C'"):
+    with pytest.raises(InputError, match="no sheet or table 'C'"):
         read_recording(both, sheet="C")
 
 
@@ -185,7 +185,7 @@ def test_a_formula_without_a_stored_value_is_refused_with_its_row(tmp_path: Path
     rows: list[list[object]] = [list(row) for row in NUMBERS]
     rows[7][2] = "=1+1"
     path = workbook(tmp_path / "a.xlsx", Test=[HEADER, *rows])
-    with pytest.raises(InputError, match=r"row 9, column 'RF \(N\)': found an empty cell, or a formula"):
+    with pytest.raises(InputError, match=r"row 9, column 'RF \(N\)': the cell is empty, or has a formula"):
         read_recording(path)
 
 
@@ -206,46 +206,55 @@ def spoiled(row: int, column: int, text: str) -> list[list[str]]:
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        ([HEADER[:2], *[row[:2] for row in ROWS]], r"row 1: .*expected a force column"),
+        ([HEADER[:2], *[row[:2] for row in ROWS]], r"row 1: .*force column .*is needed"),
         (
             [[*HEADER, "Force (N)"], *[[*row, row[1]] for row in ROWS]],
-            r"'RF \(N\)' and 'Force \(N\)', each a force column; expected .*--force NAME or NUMBER",
+            r"'RF \(N\)' and 'Force \(N\)' are force columns; .*--force NAME or NUMBER",
         ),
         (
             [["Temps (s)", "Displacement (px)", "RF (N)"], *ROWS],
-            r"'Displacement \(px\)', whose unit is 'px'; expected .* m, cm, mm, .*--displacement",
+            r"'Displacement \(px\)' is in the unit 'px'; .* m, cm, mm, .*--displacement",
         ),
-        (spoiled(3, 1, "abc"), r"row 5, column 'Déplacement \(mm\)': found 'abc'; expected a number"),
-        (spoiled(3, 1, ""), r"row 5, .*found an empty cell"),
-        (spoiled(3, 0, "10:00:01"), r"row 5, .*found a date or a time of day, '10:00:01'"),
-        (spoiled(3, 1, "1,5"), r"row 5, .*found '1,5'; expected a number with the decimal sign '.'"),
-        (spoiled(3, 1, "1_0"), r"row 5, .*found '1_0'; expected a number"),
-        (spoiled(3, 2, "nan"), r"row 5, column 'RF \(N\)': found nan; expected a finite number"),
-        (spoiled(3, 2, "-inf"), r"row 5, .*found -inf"),
-        (spoiled(9, 0, "0.4"), r"row 11: found time 0.4 s after 0.4 s; expected times that increase"),
-        (spoiled(9, 0, "0.1"), r"row 11: found time 0.1 s after 0.4 s"),
+        (
+            spoiled(3, 1, "abc"),
+            r"row 5, column 'Déplacement \(mm\)': the cell contains 'abc'; it must be a number",
+        ),
+        (spoiled(3, 1, ""), r"row 5, .*the cell is empty"),
+        (spoiled(3, 0, "10:00:01"), r"row 5, .*a date or a time of day, '10:00:01'"),
+        (spoiled(3, 1, "1,5"), r"row 5, .*contains '1,5'; it must be a number with the decimal sign '.'"),
+        (spoiled(3, 1, "1_0"), r"row 5, .*contains '1_0'; it must be a number"),
+        (spoiled(3, 2, "nan"), r"row 5, column 'RF \(N\)': the value is nan; it must be a finite number"),
+        (spoiled(3, 2, "-inf"), r"row 5, .*the value is -inf"),
+        (spoiled(9, 0, "0.4"), r"row 11: the time is 0.4 s after 0.4 s"),
+        (spoiled(9, 0, "0.1"), r"row 11: the time is 0.1 s after 0.4 s"),
         (
             [["Temps (s)", "Disp (m)", "RF (N)"], *ROWS],
-            r"found a displacement of .* m; .*is the column in mm\?",
+            r"the displacement is .* m; .*is the column in mm\?",
         ),
         (
             [["Temps (s)", "Disp (um)", "RF (N)"], *ROWS],
-            r"found a displacement that changes by .*is its unit right",
+            r"the displacement changes by .*is its unit right",
         ),
-        (spoiled(3, 2, "2000"), r"row 5: found a force of 2000 N; .*is the column in mN\?"),
-        ([HEADER, *ROWS[:40]], r"found 40 samples; expected at least 50"),
+        (spoiled(3, 2, "2000"), r"row 5: the force is 2000 N; .*is the column in mN\?"),
+        ([HEADER, *ROWS[:40]], r"samples is 40; it must be at least 50"),
         ([HEADER], r"no rows of numbers"),
-        ([*[HEADER], *ROWS[:20], ROWS[20][:2], *ROWS[21:]], r"row 22: found 2 cells; expected 3 cells"),
-        ([*[HEADER], *ROWS[:20], [*ROWS[20], "7"], *ROWS[21:]], r"row 22: found 4 cells; expected 3 cells"),
-        ([*[HEADER], *ROWS[:20], [], *ROWS[21:]], r"row 22: found an empty row before row 23"),
+        (
+            [*[HEADER], *ROWS[:20], ROWS[20][:2], *ROWS[21:]],
+            r"row 22: the number of cells is 2; it must be 3",
+        ),
+        (
+            [*[HEADER], *ROWS[:20], [*ROWS[20], "7"], *ROWS[21:]],
+            r"row 22: the number of cells is 4; it must be 3",
+        ),
+        ([*[HEADER], *ROWS[:20], [], *ROWS[21:]], r"row 22: it is empty, although numbers follow in row 23"),
         (
             ROWS,
-            r"no names above rows of 3 cells; .* import with --time 1 --displacement 2",
+            r"no names stand above rows of 3 cells; .* import with --time 1 --displacement 2",
         ),
         ([["some", "text"]], r"no rows of numbers"),
         (
             [*[HEADER], *ROWS[:20], ["n/a"] * 3, *ROWS[21:]],
-            r"row 22: found 'n/a n/a n/a' between rows of numbers",
+            r"row 22: 'n/a n/a n/a' stands between rows of numbers",
         ),
     ],
 )
@@ -260,16 +269,16 @@ def test_a_fault_is_named_with_its_place(tmp_path: Path, rows: list[list[str]], 
 def test_a_table_that_is_not_there_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", [HEADER, *ROWS], ";")
     assert_is_the_test(read_recording(path, sheet="1"))
-    with pytest.raises(InputError, match=r"the tables \['1'\]; expected a sheet 'Test 3'"):
+    with pytest.raises(InputError, match=r"no sheet or table 'Test 3'; use one of '1'"):
         read_recording(path, sheet="Test 3")
 
 
 @pytest.mark.parametrize(
     ("name", "data", "said"),
     [
-        ("a.csv", b"", "an empty file"), ("a.csv", b" \n\n", "an empty file"),
+        ("a.csv", b"", "the file is empty"), ("a.csv", b" \n\n", "the file is empty"),
         ("a.csv", b"\x00\x01\x81", "not text"), ("a.csv", b"t,d,f\n1,1\x002,3\n", "NUL within a number"),
-        ("a.txt", b"t_s d_mm f_N T_C\n" + 60 * b"1 2 3 4\n" + b"1 2 4\n", "row 62: found 3 cells"),
+        ("a.txt", b"t_s d_mm f_N T_C\n" + 60 * b"1 2 3 4\n" + b"1 2 4\n", "row 62: the number of cells is 3"),
         ("a.xlsx", b"PK\x03\x04 no workbook", "an xlsx workbook"), ("a.xlsx", b"", "an xlsx workbook"),
         ("a.h5", b"\x89HDF\r\n\x1a\n", "HDF5"), ("a.pdf", b"%PDF", "ending '.pdf'"),
     ],
@@ -281,28 +290,28 @@ def test_files_that_are_nothing_are_refused(tmp_path: Path, name: str, data: byt
 
 
 def test_a_file_that_is_absent_or_a_folder_is_refused(tmp_path: Path) -> None:
-    for path, message in ((tmp_path / "absent.csv", "no such file"), (tmp_path, "a folder")):
-        with pytest.raises(InputError, match=f": found {message}; expected a recording"):
+    for path, message in ((tmp_path / "absent.csv", "there is no such file"), (tmp_path, "it is a folder")):
+        with pytest.raises(InputError, match=f": {message}; bayeskin needs a recording"):
             read_recording(path)
 
 
 @pytest.mark.parametrize("ending", [".csv", ".xlsx", ".h5", ""])
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, ending: str) -> None:
     os.mkfifo(tmp_path / f"pipe{ending}")
-    with pytest.raises(InputError, match="found a pipe or a device instead of a file; expected a recording"):
+    with pytest.raises(InputError, match="a pipe or a device instead of a file; bayeskin needs a recording"):
         read_recording(tmp_path / f"pipe{ending}")
 
 
 def test_a_file_beyond_memory_is_refused_before_it_is_read(tmp_path: Path) -> None:
     with open(tmp_path / "a.csv", "wb") as handle:
         handle.truncate(2**31 + 1)  # a hole: takes no room
-    with pytest.raises(InputError, match="found 2147483649 bytes; expected a recording, of at most"):
+    with pytest.raises(InputError, match="2147483649 bytes; bayeskin needs a recording, of at most"):
         read_recording(tmp_path / "a.csv")
 
 
 def test_bins_beyond_memory_are_refused() -> None:
     for width_s, end_s in ((1e-9, 130.0), (1e-320, 130.0), (0.5, 1e300), (0.5, np.nan)):
-        with pytest.raises(InputError, match=r"bin_width_s: found .*; expected a width that gives fewer"):
+        with pytest.raises(InputError, match=r"bin_width_s: .*; use a width that gives fewer"):
             uniform_edges(end_s, width_s)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.reduced.build import BuildSettings
 from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.library import Library
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.runs import FullRuns
 from bayeskin.shipped import shipped
@@ -93,8 +95,8 @@ def test_one_beside_the_source_goes_before_the_shipped_one(tmp_path) -> None:
     [
         ("[device]\ngauge_mm = 0.036\n", (), "0.036 mm"),
         ("[device]\nguard_mm = { gap = -1, width = 8 }\n", (), "inside the pad"),
-        ("[device]\nlength = 3\n", (), "unknown key"),
-        (NEAR, ("-o", "model.csv"), "ending .h5"),
+        ("[device]\nlength = 3\n", (), "this key is not known"),
+        (NEAR, ("-o", "model.csv"), "use .h5"),
         (None, (), "no such file"),
     ],
 )
@@ -127,23 +129,39 @@ def test_a_finished_model_stays_as_it_is(bayeskin, tmp_path) -> None:
 def test_an_interrupted_building_goes_on_and_a_second_one_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, model, built = tmp_path / "model.h5", load_reduced(shipped(SHIPPED)), list[tuple[int, bool]]()
+    path, model, built = tmp_path / "model.h5", load_reduced(shipped(SHIPPED)), list[tuple[str, int]]()
+    without = replace(
+        model, trained=replace(model.trained, mechanisms={}), library=Library(model.library.base, {})
+    )
 
     def base(trained: object, full: FullRuns, settings: BuildSettings, *_: object) -> ReducedModel:
-        built.append((settings.base_runs, "a run" in full.store))
-        if not built[-1][1]:
+        if "a run" not in full.store:
             full.store.add("a run", {"message": ""})
-            with pytest.raises(InputError, match="in use by another bayeskin"):
+            with pytest.raises(InputError, match="another bayeskin"):
                 reducing.reduce(None, path, Silent())
             raise KeyboardInterrupt
+        built.append(("base", settings.base_runs))
+        return without
+
+    def whole(base: object, trained: object, full: FullRuns, settings: BuildSettings, *_: object) -> object:
+        if settings.runs == BuildSettings().runs and "another run" not in full.store:
+            full.store.add("another run", {"message": ""})
+            raise KeyboardInterrupt
+        built.append(("mechanisms", settings.runs))
         return model
 
     monkeypatch.setattr(reducing, "base_model", base)
-    monkeypatch.setattr(reducing, "with_mechanisms", lambda *_: model)
+    monkeypatch.setattr(reducing, "with_mechanisms", whole)
     with pytest.raises(KeyboardInterrupt):
         reducing.reduce(None, path, Silent())
     assert not path.exists()
+    with pytest.raises(KeyboardInterrupt):  # the mechanisms can be used, but better ones follow
+        reducing.reduce(None, path, Silent())
+    assert load_reduced(path).trained.mechanisms
     assert reducing.reduce(None, path, Silent())["ok"]
-    few, all_runs = BuildSettings().first_runs, BuildSettings().base_runs
-    assert built == [(few, False), (few, True), (all_runs, True)]
+    sizes = BuildSettings()
+    assert built == [
+        ("base", sizes.first_base_runs), ("base", sizes.base_runs), ("mechanisms", sizes.first_runs),
+        ("mechanisms", sizes.runs),
+    ]  # fmt: skip
     assert {file.name for file in tmp_path.iterdir()} == {"model.h5", "model.json"}

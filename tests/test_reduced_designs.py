@@ -141,7 +141,7 @@ def test_the_hash_is_of_the_reduced_model_and_of_the_full_one(ships: Path, tmp_p
         ReducedOrFull(other, FullModel(ModelSpec())),
         ReducedOrFull(ships, FullModel(thick)),
     ]
-    assert len({one.hash for one in models} | {FullModel(ModelSpec()).hash}) == 4
+    assert len({model.hash for model in models} | {FullModel(ModelSpec()).hash}) == 4
 
 
 def test_the_reduced_model_of_the_very_geometry_goes_first(ships: Path, tmp_path: Path) -> None:
@@ -162,9 +162,12 @@ def test_the_reduced_model_of_the_very_geometry_goes_first(ships: Path, tmp_path
         ({"refinement = 3": 'mesh = "skin.msh"'}, "bricks with refinement 1 or more"),
         ({"refinement = 3": 'mesh = "a.msh"\nobservation = "article"'}, "bricks with refinement 1 or more"),
         ({"refinement = 3": "refinement = 0"}, "bricks with refinement 1 or more"),
-        ({"refinement = 3": 'forward = "own.py:force"'}, "no such line, because it concerns the full model"),
+        ({"refinement = 3": 'forward = "own.py:force"'}, "it concerns the full model"),
         ({'"reduced"': '"redced"'}, "design.coarse"),
-        ({"[map]": "[tissue]\ncutis_mm = 4.0\n[map]"}, "a reduced model that `bayeskin reduce` makes"),
+        (
+            {"[map]": "[tissue]\ncutis_mm = 4.0\n[map]"},
+            "make it from the device's file with `bayeskin reduce`",
+        ),
     ],
     ids=["gmsh", "article", "coarsest", "own", "misspelt", "device"],
 )
@@ -184,7 +187,7 @@ def test_a_protocol_beyond_the_training_is_refused(
 ) -> None:
     case = measured(tmp_path, 12e-3)
     line = refused(capsys, "design", case)
-    assert "design.coarse: found 'reduced' on a protocol that article-device-reduced.h5 was not" in line
+    assert "design.coarse: article-device-reduced.h5 was not trained for this protocol" in line
     assert "the pads open by 12.00 mm, more than the trained 10 mm" in line
 
 

@@ -258,7 +258,10 @@ def test_a_damaged_file_is_refused_in_one_line(kept, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda said: said["laws"].update(preconditioning="0" * 64), "another version of preconditioning"),
+        (
+            lambda said: said["laws"].update(preconditioning="0" * 64),
+            "another version of the mechanism preconditioning",
+        ),
         (lambda said: said.update(full_model_hash="0" * 64), "another version of the full model"),
     ],
 )

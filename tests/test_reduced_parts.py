@@ -167,6 +167,15 @@ def test_a_cubature_of_all_columns_is_the_non_negative_least_squares_one() -> No
     np.testing.assert_allclose(rule.factor, 1.0, rtol=1e-4)
 
 
+def test_a_cubature_needs_no_more_points_than_there_are_rows() -> None:
+    """Non-negative least squares keeps at most as many columns as there are rows, however many are wanted."""
+    rows = np.random.default_rng(5).uniform(0.1, 1.0, (40, 600)).astype(np.float32)
+    rules = choose_points(rows, [20, 200], CubatureSettings())
+    assert len(rules[20][0].points) >= 20
+    assert len(rules[200][0].points) <= 40
+    assert rules[200][1] < CubatureSettings().exact
+
+
 def test_all_points_leave_no_linear_part_out(problem, inner) -> None:
     basis = scaled_basis(random_modes(problem, inner, 3), inner)
     at = point_fields(problem, basis)

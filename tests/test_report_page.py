@@ -104,6 +104,16 @@ def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
     assert "The full model fails at the best values: the skin folds" in failed
 
 
+def test_each_of_several_recordings_stands_beside_the_others() -> None:
+    entry = {"rms_n": 2e-3, "noise_n": 1e-3, "sd_alone": {"E_c": 0.1}, "widens": {"E_c": 2.5}}
+    text = diagnosed_as({"recordings": [
+        {"name": "first", "tension": 0.4, "contradicts": False, **entry},
+        {"name": "second", "tension": 5.2, "contradicts": True, **entry},
+    ]})  # fmt: skip
+    assert "second2 mN25.2contradicts them" in text.replace("\N{NO-BREAK SPACE}", " ")
+    assert re.search(r"first alone informs E.*; without it, the intervals would be wider by .* 2\.5\.", text)
+
+
 @pytest.mark.parametrize(
     ("verdict", "smooth", "word", "sentence"),
     [

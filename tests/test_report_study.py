@@ -38,17 +38,17 @@ def population(**further: Any) -> Population:
     return made_up.population(made_up.table(groups=GROUPS), {}, PERMEABILITY, **further)
 
 
-def facts(made: Population, left_out: Mapping[str, str] | None = None, **changed: Any) -> StudyFacts:
+def facts(result: Population, left_out: Mapping[str, str] | None = None, **changed: Any) -> StudyFacts:
     left_out = left_out or {}
-    answer = population_in_json(made)
+    answer = population_in_json(result)
     rows = [
         {
-            "name": one["name"], "subject": one["subject"], "group": one["group"], "site": None,
-            "session": None, "recording": f"{one['name']}.h5", "sha256": "r" * 64, "model_hash": "m" * 64,
-            "report": f"recordings/{one['name']}/report.html", "left_out": None,
-            "given_the_study": one["given_the_study"],
+            "name": known["name"], "subject": known["subject"], "group": known["group"], "site": None,
+            "session": None, "recording": f"{known['name']}.h5", "sha256": "r" * 64, "model_hash": "m" * 64,
+            "report": f"recordings/{known['name']}/report.html", "left_out": None,
+            "given_the_study": known["given_the_study"],
         }
-        for one in answer["recordings"]
+        for known in answer["recordings"]
     ]  # fmt: skip
     rows += [
         {**rows[0], "name": name, "report": None, "left_out": reason} for name, reason in left_out.items()
@@ -56,8 +56,8 @@ def facts(made: Population, left_out: Mapping[str, str] | None = None, **changed
     for row in rows[len(rows) - len(left_out) :]:
         del row["given_the_study"]
     figures = {
-        "population": figure_bytes(report.figure_population(made), "svg", "").decode(),
-        "recordings": figure_bytes(report.figure_recordings(made), "svg", "").decode(),
+        "population": figure_bytes(report.figure_population(result), "svg", "").decode(),
+        "recordings": figure_bytes(report.figure_recordings(result), "svg", "").decode(),
     }
     return StudyFacts(
         "keloids.toml", 'table = "t.csv"', "t.csv", "recording,subject\n",
@@ -105,10 +105,10 @@ def test_only_a_recording_with_a_report_is_a_link() -> None:
 
 
 def test_a_study_without_a_population_says_why() -> None:
-    one = facts(population(), {"broken": "no such file"})
+    known = facts(population(), {"broken": "no such file"})
     answer = {
         **ORIGIN, "ok": False, "verdict": "no population", "because": ["one subject is left"],
-        "recordings": one.answer["recordings"], "left_out": one.answer["left_out"],
+        "recordings": known.answer["recordings"], "left_out": known.answer["left_out"],
     }  # fmt: skip
     said = words(render_study(StudyFacts("k.toml", "", "t.csv", "", answer, {})))
     assert "no population No population: one subject is left." in said

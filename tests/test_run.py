@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from html import unescape
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from toys.coarse_proposals import propose_coarsely
 
 from bayeskin import inference, report, storage
 from bayeskin.design_files import load_design
+from bayeskin.errors import InputError
 from bayeskin.execution.local import here
 from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
 from bayeskin.number_format import interval
@@ -28,6 +30,7 @@ from bayeskin.workflow import executor, maximum, model, stages, waves
 from bayeskin.workflow.calibration import refined_posterior
 from bayeskin.workflow.checking import checked_posterior, with_full_model
 from bayeskin.workflow.engine import Silent, open_run
+from bayeskin.workflow.exporting import export
 from bayeskin.workflow.indices import nearby
 
 TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
@@ -125,9 +128,9 @@ def test_priors_with_their_sources_and_what_the_data_says_are_printed(folder: Pa
     summary = json.loads((folder / "case" / "summary.json").read_text())
     for stage in (None, "sample"):
         text = stages.run(folder / "case.toml", stage, Silent())["text"]
-        for name, one in summary["posterior"].items():
-            prior = one["prior"]
-            bounds = interval(prior["lower"], prior["upper"], one["unit"])
+        for name, parameter in summary["posterior"].items():
+            prior = parameter["prior"]
+            bounds = interval(prior["lower"], prior["upper"], parameter["unit"])
             assert f"  {name}: {prior['kind']}, {bounds}; {prior['source']}" in text
         assert [line for line in summary["identifiability"] if f"  {line}" not in text] == []
     assert set(summary["profiles"]) == set(SPACE.names)
@@ -136,7 +139,7 @@ def test_priors_with_their_sources_and_what_the_data_says_are_printed(folder: Pa
 def test_what_the_fit_leaves_is_tested_and_said(folder: Path) -> None:
     said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
     residuals = said["residuals"]
-    assert sum(one["bins"] for one in residuals["by_kind"].values()) == 75  # those fitted
+    assert sum(kind["bins"] for kind in residuals["by_kind"].values()) == 75  # those fitted
     assert residuals["passes"] == (residuals["sentence"] not in said["remarks"])
     shown = (folder / "case" / "report.html").read_text()
     assert str(prose(residuals["sentence"])) in shown
@@ -298,3 +301,52 @@ def test_nearby_is_a_tenth_either_way_inside_the_prior() -> None:
         at_bound = nearby(space, {**at, "E_c": bound})
         assert space.contains([at_bound.lower, at_bound.upper]).all()
         assert at_bound.lower[0] < at_bound.upper[0]
+
+
+def test_a_posterior_is_exported_as_a_table_of_its_draws(folder: Path, tmp_path: Path) -> None:
+    answer = export(folder / "case.toml", tmp_path / "draws.csv", Silent())
+    header = (tmp_path / "draws.csv").read_text().splitlines()[0].split(",")
+    table = np.loadtxt(tmp_path / "draws.csv", delimiter=",", skiprows=1)
+    posterior = load_inference_data(folder / "case" / "sample" / "posterior.nc")["posterior"]
+    assert header[:2] == ["E_c [Pa]", "E_s [Pa]"]
+    assert len(table) == answer["draws"]
+    for column, name in zip(table.T, answer["parameters"], strict=True):
+        np.testing.assert_array_equal(column, posterior[name].values.ravel())
+
+
+def test_an_exported_normal_has_the_moments_of_the_draws(folder: Path, tmp_path: Path) -> None:
+    export(folder / "case.toml", tmp_path / "normal.json", Silent())
+    normal = json.loads((tmp_path / "normal.json").read_text())
+    posterior = load_inference_data(folder / "case" / "sample" / "posterior.nc")["posterior"]
+    values = []
+    for parameter in normal["parameters"]:
+        draws = posterior[parameter["name"]].values.ravel()
+        assert parameter["median"] == pytest.approx(np.median(draws))
+        values.append(np.log(draws) if parameter["normal_in"] == "logarithm" else draws)
+        assert parameter["mean"] == pytest.approx(values[-1].mean())
+    np.testing.assert_allclose(normal["covariance"], np.cov(values), rtol=1e-10)
+    by_name = {parameter["name"]: parameter["normal_in"] for parameter in normal["parameters"]}
+    assert (by_name["E_c"], by_name["p_init"]) == ("logarithm", "value")
+
+
+def test_exported_materials_have_the_medians_in_febio_s_terms(folder: Path, tmp_path: Path) -> None:
+    export(folder / "case.toml", tmp_path / "skin.feb", Silent())
+    spec = ElementTree.parse(tmp_path / "skin.feb").getroot()
+    posterior = load_inference_data(folder / "case" / "sample" / "posterior.nc")["posterior"]
+    for layer, letter, solid_share, ratio in (("cutis", "c", 0.8, 0.48), ("subcutis", "s", 0.6, 0.3)):
+        material = spec.find(f"./Material/material[@name='{layer}']")
+        assert material is not None
+        said = [material.findtext(path) for path in ("phi0", "solid/E", "solid/v", "permeability/perm")]
+        median = {name: float(np.median(posterior[name])) for name in (f"E_{letter}", f"k_{letter}")}
+        expected = [solid_share, median[f"E_{letter}"], ratio, median[f"k_{letter}"] / 5e-3]
+        np.testing.assert_allclose([float(text or "nan") for text in said], expected, rtol=1e-9)
+
+
+def test_a_posterior_that_is_not_there_is_not_exported(folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "measured.h5", tmp_path)
+    shutil.copy(folder / "case.toml", tmp_path)
+    with pytest.raises(InputError, match="not run"):
+        export(tmp_path / "case.toml", tmp_path / "skin.feb", Silent())
+    with pytest.raises(InputError, match="ending"):
+        export(folder / "case.toml", tmp_path / "skin.xml", Silent())
+    assert not list(tmp_path.glob("skin.*"))

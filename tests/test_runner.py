@@ -259,10 +259,10 @@ def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole:
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        ("theta", np.zeros((3, 2)), r"theta: found shape \(3, 2\); expected shape"),
-        ("messages", ("",), "messages: found 1 messages"),
-        ("edges_s", np.zeros((2, 2)), "edges_s: found shape"),
-        ("theta", np.full(WAVE.theta.shape, np.nan), "values that are not finite"),
+        ("theta", np.zeros((3, 2)), r"theta: its shape is \(3, 2\); it must be"),
+        ("messages", ("",), "messages: the number of messages is 1"),
+        ("edges_s", np.zeros((2, 2)), "edges_s: its shape"),
+        ("theta", np.full(WAVE.theta.shape, np.nan), "some values are not finite"),
     ],
 )
 def test_a_design_whose_arrays_do_not_belong_together_is_refused(

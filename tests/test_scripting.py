@@ -119,13 +119,15 @@ def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(
         "fit": {"windows_s": np.array([[0.0, 75.0]])},
         "seed": np.int64(3),
     }
-    one = bk.calibrate(recording, folder=tmp_path, **small)  # the shipped surrogate that knows the protocol
+    posterior = bk.calibrate(
+        recording, folder=tmp_path, **small
+    )  # the shipped surrogate that knows the protocol
     files = {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
     again = bk.calibrate(recording, folder=tmp_path, **small)
     assert len(files) == 2
     assert files == {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
-    np.testing.assert_array_equal(draws_of(one)[1], draws_of(again)[1])
-    config = json.loads(one.attrs["provenance"])["config"]
+    np.testing.assert_array_equal(draws_of(posterior)[1], draws_of(again)[1])
+    config = json.loads(posterior.attrs["provenance"])["config"]
     assert (config["seed"], config["fit"]["windows_s"]) == (3, [[0.0, 75.0]])
 
 
@@ -148,7 +150,7 @@ def test_draws_by_another_surrogate_are_not_weighed(said: dict[str, Any]) -> Non
     made_of = json.loads(posterior.attrs["provenance"])
     made_of["identity"]["surrogate"] = "of a run that has trained on"
     posterior.attrs["provenance"] = json.dumps(made_of)
-    with pytest.raises(InputError, match="posterior: found a posterior by another surrogate"):
+    with pytest.raises(InputError, match="posterior: it was made with another surrogate"):
         bk.check(said["recording"], posterior, 8)
 
 
@@ -176,12 +178,12 @@ def test_a_script_that_diagnoses_needs_no_guard(tmp_path: Path) -> None:
 
 def test_wrong_input_is_one_line() -> None:
     for call in (bk.calibrate, bk.simulate, bk.diagnose):
-        with pytest.raises(InputError, match=r"found str 'data/demo.h5'; expected a recording of bk.load"):
+        with pytest.raises(InputError, match=r"'data/demo.h5' has the type str; use a recording of bk.load"):
             call("data/demo.h5")
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
-    with pytest.raises(InputError, match=r"settings: sample.walker: found an unknown key"):
+    with pytest.raises(InputError, match=r"settings: sample.walker: this key is not known"):
         bk.calibrate(recording, "demo.h5", sample={"walker": 3})
-    with pytest.raises(InputError, match="theta: found E_x; expected some of E_c"):
+    with pytest.raises(InputError, match="theta: E_x is not known; use some of E_c"):
         bk.simulate(recording, {"E_x": 1.0})
     time_s = np.linspace(0.0, 60.0, 601)
     ramp = np.interp(time_s, [0, 10, 20, 40, 50, 60], [0, 0, 5e-3, 5e-3, 0, 0])
@@ -193,7 +195,7 @@ def test_wrong_input_is_one_line() -> None:
 def test_a_posterior_of_another_recording_is_refused(said: dict[str, Any]) -> None:
     time_s = np.linspace(0.0, 60.0, 601)
     other = Recording(time_s, 1e-4 * time_s, 0.01 * time_s, "other", "1" * 64)
-    with pytest.raises(InputError, match="found the posterior of another recording than other"):
+    with pytest.raises(InputError, match="belongs to another recording than other"):
         bk.check(other, said["posterior"])
 
 
@@ -209,7 +211,7 @@ def test_a_configuration_written_out_reads_back_the_same(tmp_path: Path) -> None
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, bayeskin; print([m for m in ('numpy', 'arviz', 'numba') if m in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.strip() == "[]"
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = bk.nothing

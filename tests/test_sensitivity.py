@@ -125,13 +125,13 @@ def test_indices_of_the_shipped_surrogate_agree_with_salib(by_salib, method):
 
     Few samples say much of rests, where rare points have all.
     """
-    surrogate, found = by_salib
+    surrogate, known = by_salib
     result = sobol(surrogate, np.random.default_rng(2), 4096, method=method)
     pairs = np.triu_indices(len(surrogate.space.names), 1)
-    for one, theirs in found.items():
-        assert np.all(np.abs(result.first[:, one] - theirs["S1"]) < 0.01 + 1.5 * theirs["S1_conf"])
-        assert np.all(np.abs(result.total[:, one] - theirs["ST"]) < 0.01 + 1.5 * theirs["ST_conf"])
-        off = np.abs(result.second[:, one] - theirs["S2"][pairs])
+    for column, theirs in known.items():
+        assert np.all(np.abs(result.first[:, column] - theirs["S1"]) < 0.01 + 1.5 * theirs["S1_conf"])
+        assert np.all(np.abs(result.total[:, column] - theirs["ST"]) < 0.01 + 1.5 * theirs["ST_conf"])
+        off = np.abs(result.second[:, column] - theirs["S2"][pairs])
         assert np.all(off < 0.01 + 1.5 * theirs["S2_conf"][pairs])
 
 
@@ -143,7 +143,7 @@ def test_one_parameter_has_all_the_variance(estimate):
 
 
 def test_samples_that_carry_nothing_but_a_constant_are_refused():
-    with pytest.raises(InputError, match=r"sobol\.samples: found 8; expected at least 20 with 4 parameters"):
+    with pytest.raises(InputError, match=r"sobol\.samples: 8 .* at least 20 with 4 parameters"):
         projection(sobol_g, box(4, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 8)
 
 
@@ -213,12 +213,14 @@ def test_aggregated_indices_weigh_bins_by_variance_and_width():
 
 def test_the_two_methods_agree_on_a_relaxing_spring():
     surrogate = KnownSurrogate(0.0)
-    one = sobol(surrogate, np.random.default_rng(0), 1024, method="pick-freeze")
-    two = sobol(surrogate, np.random.default_rng(0), 1024, method="projection")
-    np.testing.assert_allclose(one.total_aggregated, two.total_aggregated, atol=0.02)
-    assert two.unexplained < 1e-3
-    assert uninformed(one) == uninformed(two) == ("k_c", "p_init")
-    assert sentence(one).startswith("The force does not inform k_c and p_init: their total Sobol' indices")
+    by_freezing = sobol(surrogate, np.random.default_rng(0), 1024, method="pick-freeze")
+    by_projection = sobol(surrogate, np.random.default_rng(0), 1024, method="projection")
+    np.testing.assert_allclose(by_freezing.total_aggregated, by_projection.total_aggregated, atol=0.02)
+    assert by_projection.unexplained < 1e-3
+    assert uninformed(by_freezing) == uninformed(by_projection) == ("k_c", "p_init")
+    assert sentence(by_freezing).startswith(
+        "The force does not inform k_c and p_init: their total Sobol' indices"
+    )
 
 
 def test_inert_parameters_have_a_total_index_of_zero():
@@ -264,7 +266,7 @@ def test_the_input_distribution_is_stated_and_can_be_narrower():
 
 
 def test_the_same_seed_gives_the_same_numbers():
-    one, two = (sobol(KnownSurrogate(0.01), np.random.default_rng(0), 64) for _ in range(2))
-    assert np.array_equal(one.total_interval, two.total_interval, equal_nan=True)
-    three = sobol(KnownSurrogate(0.01), np.random.default_rng(1), 64)
-    assert not np.array_equal(one.total_aggregated, three.total_aggregated)
+    first, second = (sobol(KnownSurrogate(0.01), np.random.default_rng(0), 64) for _ in range(2))
+    assert np.array_equal(first.total_interval, second.total_interval, equal_nan=True)
+    other = sobol(KnownSurrogate(0.01), np.random.default_rng(1), 64)
+    assert not np.array_equal(first.total_aggregated, other.total_aggregated)

@@ -1,4 +1,4 @@
-"""`bayeskin study`: recordings are inferred, left out or found done, and the population follows from them."""
+"""`bayeskin study` infers recordings, skips finished ones, leaves out others, and infers the population."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_a_group_that_failures_leave_with_one_subject_ends_without_a_population(
     (tmp_path / "rec" / "d-1.h5").write_bytes(b"damaged")
     answer = run_study(tmp_path / finished.name, Silent())
     assert (answer["ok"], answer["verdict"]) == (False, "no population")
-    assert "a group of one subject" in answer["text"]
+    assert "has one subject only" in answer["text"]
     assert list(answer["left_out"]) == ["d-1", "e-1"]
     assert "d-1" in (tmp_path / "springs" / "report.html").read_text()
 
@@ -178,7 +178,7 @@ def test_a_group_that_failures_leave_with_one_subject_ends_without_a_population(
     [
         (None, ["R-hat is 1.3", "more"], "its posterior is not trusted: R-hat is 1.3"),
         ({"message": "too few runs"}, [], "the stage sample failed: too few runs"),
-        (InputError("a.h5", "nothing", "a test"), [], "a.h5: found nothing; expected a test"),
+        (InputError("a.h5", "it is empty", "give a test"), [], "a.h5: it is empty; give a test"),
         (ZeroDivisionError("by\nzero"), [], "ZeroDivisionError: by zero"),
         (None, [], ""),
     ],
@@ -217,19 +217,19 @@ DEVICE = "[device]\ngauge_mm = 30.0\n"
 @pytest.mark.parametrize(
     ("change", "table", "says"),
     [
-        ({'table = "table.csv"': ""}, "", "springs.toml: table: found nothing"),
-        ({'table = "table.csv"': "table = 3"}, "", "springs.toml: table: found 3"),
-        ({"table.csv": "none.csv"}, "", "none.csv: found no such file"),
-        ({"[fit]": '[recording]\nfile = "a.h5"\n[fit]'}, "", "none, because the table names them"),
+        ({'table = "table.csv"': ""}, "", "springs.toml: table: there is no table"),
+        ({'table = "table.csv"': "table = 3"}, "", "springs.toml: table: 3 is not the name of a file"),
+        ({"table.csv": "none.csv"}, "", "none.csv: there is no such file"),
+        ({"[fit]": '[recording]\nfile = "a.h5"\n[fit]'}, "", "the table names the recordings"),
         ({"[fit]": "recording = 3\n[fit]"}, "", "springs.toml: "),
-        ({"bin_width_s": "bin_width"}, "", "springs.toml: fit.bin_width: found an unknown key"),
+        ({"bin_width_s": "bin_width"}, "", "springs.toml: fit.bin_width: this key is not known"),
         ({"spring.py": "none.py"}, "", "none.py"),
-        ({}, "rec/x.h5,ella,keloid\n", "'rec/x.h5': no such file"),
-        ({}, "rec/a-1.h5,ella,keloid\n", "found a-1.h5, which is also in"),
-        ({}, "rec/e-1.h5,ella,scar\n", "found 'scar', a group of one subject"),
-        ({}, "rec/e-1.h5,ella,keloid,3\n", "found 4 cells; expected 3 cells"),
+        ({}, "rec/x.h5,ella,keloid\n", "'rec/x.h5': there is no such file"),
+        ({}, "rec/a-1.h5,ella,keloid\n", "a-1.h5 is also in"),
+        ({}, "rec/e-1.h5,ella,scar\n", "'scar' has one subject only"),
+        ({}, "rec/e-1.h5,ella,keloid,3\n", "cells is 4; it must be 3"),
         ({"lower = 10.0": "lower = -10.0", 'prior = "log-uniform"\nunit = "N/m"': "", "lower = 1.0":
-          "lower = -1.0", 'prior = "log-uniform"\nunit = "s"': ""}, "", "none that is always positive"),
+          "lower = -1.0", 'prior = "log-uniform"\nunit = "s"': ""}, "", "none is always positive"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_refused_in_one_line_and_nothing_is_written(
@@ -248,9 +248,9 @@ def test_wrong_input_is_refused_in_one_line_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("section", "says"),
     [
-        (DEVICE, "no such column, because"),
-        ('[surrogate]\nfile = "demo.h5"\n', "found 2 different devices; expected one device"),
-        ("", "found none for this device and tissue"),
+        (DEVICE, "has the section [device]"),
+        ('[surrogate]\nfile = "demo.h5"\n', "devices is 2; it must be one"),
+        ("", "there is none for this device and tissue"),
     ],
 )
 def test_devices_that_the_settings_cannot_serve_are_refused(

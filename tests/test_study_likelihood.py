@@ -98,10 +98,10 @@ def test_the_prior_under_which_draws_were_made_does_not_matter(parameter: Parame
 
 
 def test_the_correlation_of_a_prior_is_divided_out() -> None:
-    one, other = (
+    first, second = (
         Parameter(name, "Pa", 1e3, 1e7, "log-normal", centre=1e5, spread=0.5) for name in ("E_c", "E_s")
     )
-    space = ParameterSpace((one, other), (Correlation("E_c", "E_s", 0.9),))
+    space = ParameterSpace((first, second), (Correlation("E_c", "E_s", 0.9),))
 
     def log_likelihood(x: Array) -> Array:
         return -0.5 * np.sum(((x - np.log(1e5)) / 0.5) ** 2, axis=1)
@@ -154,7 +154,9 @@ def test_recordings_with_other_parameters_are_refused() -> None:
     fewer = ParameterSpace(LOG_UNIFORM.parameters[:1])
     recordings = [Individual(name, space, space.draw(rng, 200)) for name, space in
                   (("arm-1", LOG_UNIFORM), ("arm-2", fewer))]  # fmt: skip
-    with pytest.raises(InputError, match=r"arm-2: found parameters E_c; expected E_c, k_s, as in arm-1"):
+    with pytest.raises(
+        InputError, match=r"arm-2: its parameters are E_c; they must be E_c, k_s, as in arm-1"
+    ):
         Likelihoods.of(recordings, rng)
 
 

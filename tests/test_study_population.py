@@ -28,21 +28,21 @@ def measured(table, true_x: Array, errors: Array) -> tuple[Array, list[Individua
     rng = np.random.default_rng(1)
     y = np.array([rng.multivariate_normal(x, error) for x, error in zip(true_x, errors, strict=True)])
     named = zip(table, y, errors, strict=True)
-    return y, [normal.individual(entry.recording.name, one, error) for entry, one, error in named]
+    return y, [normal.individual(entry.recording.name, values, error) for entry, values, error in named]
 
 
-def assert_alike(one: State, other: State, close: float) -> None:
+def assert_alike(state: State, other: State, close: float) -> None:
     """Compares means and sds of all parameters, in sd; `close` is four standard errors or more."""
-    for a, b in zip(coordinates(one), coordinates(other), strict=True):
+    for a, b in zip(coordinates(state), coordinates(other), strict=True):
         sd = b.std(axis=0)
         assert np.abs((a.mean(axis=0) - b.mean(axis=0)) / sd).max() < close
         assert np.abs(np.log(a.std(axis=0) / sd)).max() < close
 
 
 def coordinates(state: State) -> list[Array]:
-    log_sds = [0.5 * np.log(np.diagonal(one, axis1=1, axis2=2)) for one in state.covariances]
-    ties = [np.arctanh(one[:, 0, 1:] / np.sqrt(one[:, 0, :1] * one[:, 1:, 1])) for one in state.covariances
-            if one.shape[1] == 2]  # fmt: skip
+    log_sds = [0.5 * np.log(np.diagonal(level, axis1=1, axis2=2)) for level in state.covariances]
+    pairs = [level for level in state.covariances if level.shape[1] == 2]
+    ties = [np.arctanh(level[:, 0, 1:] / np.sqrt(level[:, 0, :1] * level[:, 1:, 1])) for level in pairs]
     return [state.x, state.coefficients, *state.values, *log_sds, *ties]
 
 
@@ -195,10 +195,10 @@ def test_a_posterior_that_leans_on_a_bound_is_counted() -> None:
 def test_too_few_sweeps_are_not_trusted_and_the_same_generator_gives_the_same_result() -> None:
     table = made_up.table(subjects=2, sessions=1, groups=())
     settings = SamplerSettings(max_sweeps=20)
-    one, same = (inferred(table, [1e5, 2e5], settings) for _ in range(2))
-    assert not one.trusted
-    assert one.parameters == same.parameters
-    assert one.recordings == same.recordings
+    result, same = (inferred(table, [1e5, 2e5], settings) for _ in range(2))
+    assert not result.trusted
+    assert result.parameters == same.parameters
+    assert result.recordings == same.recordings
 
 
 def test_draws_that_contradict_the_fitted_likelihood_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,7 +211,8 @@ def test_draws_that_contradict_the_fitted_likelihood_are_noticed(monkeypatch: py
         for e, m in zip(table, moduli, strict=True)
     ]
     assert not any(
-        one.contradicts for one in infer_population(table, individuals, rng, settings=QUICK).overlaps
+        overlapping.contradicts
+        for overlapping in infer_population(table, individuals, rng, settings=QUICK).overlaps
     )
     fit, count = NormalMixture.of.__func__, itertools.count()
 
@@ -221,7 +222,7 @@ def test_draws_that_contradict_the_fitted_likelihood_are_noticed(monkeypatch: py
 
     monkeypatch.setattr(NormalMixture, "of", classmethod(shifted))
     wrong = infer_population(table, individuals, rng, settings=QUICK).overlaps
-    assert [n for n, one in enumerate(wrong) if one.contradicts] == [3]
+    assert [n for n, overlapping in enumerate(wrong) if overlapping.contradicts] == [3]
 
 
 def test_weighted_draws_of_a_recording_that_says_nothing_are_those_of_the_population() -> None:
@@ -232,10 +233,10 @@ def test_weighted_draws_of_a_recording_that_says_nothing_are_those_of_the_popula
     model = Model.of(Layout.of(made_up.table(1, 1, ())), tuple(np.log([[1e4], [2e6]])), Priors())
     x = np.log(2e5) + 0.5 * rng.standard_normal((4000, 1, 1))
     draws = State(x, 0.0 * x[..., 0], np.full((4000, 1, 1), np.log(2e5)), (), (np.full((4000, 1, 1), 0.25),))
-    found = overlap(0, silent, model, draws)
-    assert found.shift_sd < 0.1
-    assert 100 < found.effective < 2000
-    assert not found.poor
+    overlapping = overlap(0, silent, model, draws)
+    assert overlapping.shift_sd < 0.1
+    assert 100 < overlapping.effective < 2000
+    assert not overlapping.poor
     narrow = replace(
         draws, x=np.log(2e5) + 0.002 * (x - np.log(2e5)), covariances=(1e-6 * draws.covariances[0],)
     )

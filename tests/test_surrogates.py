@@ -140,7 +140,9 @@ def test_focus_lowers_the_error_where_it_lies():
 def test_outside_the_box_is_refused_by_name(gp):
     theta = np.tile(SPACE.from_unit(np.full(5, 0.5)), (3, 1))
     theta[1, 3] = 1e-10
-    with pytest.raises(InputError, match=r"theta row 1: k_s: found 1e-10 m\^2; expected 1e-16 to 1e-11"):
+    with pytest.raises(
+        InputError, match=r"theta row 1: k_s: it is 1e-10 m\^2; it must lie within 1e-16 to 1e-11"
+    ):
         gp[0].predict(theta)
     theta[1, 3] = np.nan
     with pytest.raises(InputError, match="k_s"):
@@ -154,7 +156,7 @@ def test_outside_the_box_is_refused_by_name(gp):
     ("change", "match"),
     [
         (lambda d: replace(d, ok=np.arange(len(d.ok)) < 5), "at least 8"),
-        (lambda d: replace(d, force_n=np.zeros_like(d.force_n)), "zero force"),
+        (lambda d: replace(d, force_n=np.zeros_like(d.force_n)), "the force is zero"),
         (lambda d: replace(d, force_n=np.where(d.force_n > 1e-3, np.nan, d.force_n)), "finite"),
     ],
 )
@@ -218,10 +220,10 @@ def damage_origin(path):
     [
         (damage_array, "hash"),
         (damage_box, "hash"),
-        (damage_version, "format version 99; expected format version 5"),
+        (damage_version, "format is 99; it must be 5"),
         (damage_origin, "another origin"),
-        (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "not readable"),
-        (lambda path: path.write_text("time,force\n"), "not readable"),
+        (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "cannot be read"),
+        (lambda path: path.write_text("time,force\n"), "cannot be read"),
         (lambda path: path.unlink(), "no such file"),
     ],
 )
@@ -247,29 +249,29 @@ def of_shape(name, values):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda handle: handle.attrs.update(format_version="abc"), "found format version abc; expected"),
-        (lambda handle: handle.attrs.update(format_version=np.arange(3)), "found format version"),
-        (lambda handle: handle.attrs.update(kind="other"), "contents that cannot be read"),
+        (lambda handle: handle.attrs.update(format_version="abc"), "format is abc"),
+        (lambda handle: handle.attrs.update(format_version=np.arange(3)), "version of its format is"),
+        (lambda handle: handle.attrs.update(kind="other"), "its contents cannot be read"),
         (
             lambda handle: handle.attrs.update(manifest="[]"),
-            "manifest or provenance: found JSON that is no",
+            "manifest or provenance: it is not a JSON",
         ),
-        (lambda handle: handle.attrs.update(manifest="[" * 20000), "contents that cannot be read"),
-        (lambda handle: handle.attrs.pop("manifest"), "contents that cannot be read"),
-        (lambda handle: handle.attrs.update(manifest="{}"), "manifest: model_hash: found None"),
+        (lambda handle: handle.attrs.update(manifest="[" * 20000), "its contents cannot be read"),
+        (lambda handle: handle.attrs.pop("manifest"), "its contents cannot be read"),
+        (lambda handle: handle.attrs.update(manifest="{}"), "manifest: model_hash: it is None"),
         (lambda handle: handle.attrs.update(manifest='{"model_hash": "0"}'), "manifest: parameters"),
         (lambda handle: handle.attrs.update(provenance="[1]"), "manifest or provenance"),
-        (of_shape("transform/mean", np.ones((2, 2))), r"transform: mean: found shape \(2, 2\)"),
-        (of_shape("transform/components", np.ones(3)), "transform: components: found shape"),
-        (of_shape("transform/truncation", np.ones(1)), "transform: truncation: found shape"),
-        (of_shape("transform/mean", b"text"), "mean: found"),
-        (of_shape("edges_s", np.ones((2, 2))), r"edges_s: found shape \(2, 2\)"),
-        (of_shape("edges_s", np.zeros(len(EDGES_S))), "edges_s: found edges that do not increase"),
-        (of_shape("edges_s", np.full(len(EDGES_S), np.nan)), "edges_s: found values that are not finite"),
-        (of_shape("active", np.array([0, 1, 2, 3, 9])), r"active: found inputs \[0, 1, 2, 3, 9\]"),
-        (of_shape("latents/nuggets", np.ones(99)), r"latents: nuggets: found shape \(99,\)"),
-        (of_shape("latents/inputs", np.ones((3, 2, 2))), "latents: inputs: found shape"),
-        (of_shape("space/parameters", 1.0), "contents that cannot be read"),
+        (of_shape("transform/mean", np.ones((2, 2))), r"transform: mean: the shape is \(2, 2\)"),
+        (of_shape("transform/components", np.ones(3)), "transform: components: the shape"),
+        (of_shape("transform/truncation", np.ones(1)), "transform: truncation: the shape"),
+        (of_shape("transform/mean", b"text"), "mean: "),
+        (of_shape("edges_s", np.ones((2, 2))), r"edges_s: the shape is \(2, 2\)"),
+        (of_shape("edges_s", np.zeros(len(EDGES_S))), "edges_s: the edges do not increase"),
+        (of_shape("edges_s", np.full(len(EDGES_S), np.nan)), "edges_s: some values are not finite"),
+        (of_shape("active", np.array([0, 1, 2, 3, 9])), r"active: it contains \[0, 1, 2, 3, 9\]"),
+        (of_shape("latents/nuggets", np.ones(99)), r"latents: nuggets: the shape is \(99,\)"),
+        (of_shape("latents/inputs", np.ones((3, 2, 2))), "latents: inputs: the shape"),
+        (of_shape("space/parameters", 1.0), "its contents cannot be read"),
     ],
 )
 def test_files_with_other_contents_are_refused_in_one_line(gp, tmp_path, change, match):

@@ -104,10 +104,10 @@ def test_the_reduced_models_derivatives_are_differences_of_runs(names, changed) 
     model = model_at(theta)
     changes = {name: theta[name] for name in changed}
     slopes = ReducedGradients(model, theta, changes, binds, MOTION, space_at)
-    steps, found = followed(model, slopes, 1e-3)
-    for name, column in zip(changes, found.T, strict=True):
+    steps, derivatives = followed(model, slopes, 1e-3)
+    for name, column in zip(changes, derivatives.T, strict=True):
         right = differences(model_at, theta, name, steps)
-        assert np.abs(right).max() > 1e-3 * np.abs(found).max()
+        assert np.abs(right).max() > 1e-3 * np.abs(derivatives).max()
         np.testing.assert_allclose(column, right, rtol=0, atol=2e-3 * np.abs(right).max(), err_msg=name)
 
 
@@ -122,11 +122,11 @@ def test_the_full_models_derivatives_are_differences_of_runs(names) -> None:
     model = model_at(theta)
     changes = {name: theta[name] for name in (*LENGTHS, "E_c", "E_s", "k_c", "k_s")}
     slopes = ForceGradients(model, theta, changes, binds, partial(problem_at, SPEC))
-    steps, found = followed(model, slopes, 1e-2)
+    steps, derivatives = followed(model, slopes, 1e-2)
     model.solver.release()
-    for name, column in zip(changes, found.T, strict=True):
+    for name, column in zip(changes, derivatives.T, strict=True):
         right = differences(model_at, theta, name, steps)
-        allowed = 1e-4 * np.abs(found).max() + 1e-3 * np.abs(right).max()
+        allowed = 1e-4 * np.abs(derivatives).max() + 1e-3 * np.abs(right).max()
         np.testing.assert_allclose(column, right, rtol=0, atol=allowed, err_msg=name)
 
 
@@ -140,5 +140,5 @@ def test_lengths_among_the_parameters_move_the_nodes() -> None:
 
 
 def test_lengths_that_cannot_be_are_refused() -> None:
-    with pytest.raises(InputError, match="cutis_m: found 20 mm; expected"):
+    with pytest.raises(InputError, match="cutis_m: it is 20 mm; it must be"):
         simulate(SPEC, MOTION, THETA | {"cutis_m": 20e-3})

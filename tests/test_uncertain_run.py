@@ -65,16 +65,22 @@ def test_a_prior_of_a_length_can_be_stated(tmp_path: Path) -> None:
     [
         (
             "[parameters.cutis_m]\nupper = 0.02\n",
-            "parameters.cutis_m: found 1.4 to 20 mm; expected 0.3 to 10 mm",
+            "parameters.cutis_m: its prior reaches from 1.4 to 20 mm, too far; it must be 0.3 to 10 mm",
         ),
         (
             "[parameters.arm_radius_m]\nlower = 0.02\n",
-            "parameters.arm_radius_m: found 20 to 72 mm; expected at least",
+            "parameters.arm_radius_m: its prior reaches from 20 to 72 mm, too far; it must be at least",
         ),
-        ("[parameters.subcutis_m]\nupper = 0.01\n", "parameters.subcutis_m: found an unknown parameter"),
-        ('[model]\nmesh = "skin.msh"\n', "tissue.cutis_mm: found a mean and an sd, with 'skin.msh'"),
-        ('[model]\nmesh = "skin.msh"\nobservation = "article"\n', "a mean and an sd, with 'article'"),
-        ('[model]\nforward = "own.py:force"\n', "a mean and an sd, with 'own'"),
+        ("[parameters.subcutis_m]\nupper = 0.01\n", "parameters.subcutis_m: this parameter is not known"),
+        (
+            '[model]\nmesh = "skin.msh"\n',
+            "tissue.cutis_mm: 'skin.msh' in [model] does not allow a mean and an sd",
+        ),
+        (
+            '[model]\nmesh = "skin.msh"\nobservation = "article"\n',
+            "'article' in [model] does not allow a mean and an sd",
+        ),
+        ('[model]\nforward = "own.py:force"\n', "'own' in [model] does not allow a mean and an sd"),
     ],
 )
 def test_what_cannot_be_uncertain_is_refused(tmp_path: Path, more: str, says: str) -> None:
@@ -90,7 +96,7 @@ def test_a_shipped_surrogate_knows_no_length(tmp_path: Path, capsys: pytest.Capt
         cli.main(["run", str(case)])
     assert end.value.code == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "surrogate.file demo.h5: found a surrogate without cutis_m" in last
+    assert "surrogate.file demo.h5: it has no parameter cutis_m" in last
 
 
 def test_new_writes_a_configuration_that_runs(tmp_path: Path) -> None:

@@ -151,7 +151,7 @@ def test_a_folder_serves_one_process_and_is_free_when_that_is_killed(tmp_path: P
     )
     holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
     holder.stdout.readline()
-    said = rf"in use by another bayeskin \(process {holder.pid}\)"
+    said = rf"another bayeskin \(process {holder.pid}\)"
     with pytest.raises(InputError, match=said), folder.locked(tmp_path):
         pass
     os.kill(holder.pid, signal.SIGKILL)

@@ -15,11 +15,12 @@ from collections.abc import Sequence
 import click
 
 import bayeskin
+from bayeskin.cli.app import app
 from bayeskin.cli.installation import doctor
 from bayeskin.cli.mismatch import diagnose, experiment
 from bayeskin.cli.models import reduce_, serve, simulate
 from bayeskin.cli.recordings import import_, new
-from bayeskin.cli.runs import STAGES, report, run, study
+from bayeskin.cli.runs import STAGES, export, report, run, study
 from bayeskin.cli.terminal import exit_code
 from bayeskin.cli.validation import conceal, prove
 
@@ -30,9 +31,9 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 # All commands, in the order in which a user needs them.
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
-    "From a recording to an answer": (doctor, new, import_, run, diagnose, report, study),
+    "From a recording to an answer": (doctor, new, import_, run, diagnose, report, study, app),
     "Single stages": (reduce_, *STAGES),
-    "Further commands": (experiment, simulate, serve, prove, conceal),
+    "Further commands": (experiment, simulate, export, serve, prove, conceal),
 }
 
 

@@ -20,7 +20,7 @@ from bayeskin.cli.terminal import Terminal
 def diagnose(sources: tuple[Path, ...], device: Path | None) -> Mapping[str, Any]:
     """Find the physics that the model leaves out of a recording, and where; show how the fit improves.
 
-    SOURCES is a configuration, a recording by itself, of any protocol, or several recordings of one skin.
+    SOURCES is a configuration, or a recording of any protocol, or several recordings of one skin.
     Several recordings share the skin and its mechanisms. Each has its own initial pressure, noise and
     mechanisms of the instrument. A recording that contradicts the others is pointed out.
 
@@ -51,12 +51,13 @@ def experiment(sources: tuple[Path, ...], device: Path | None) -> Mapping[str, A
     """Propose the further test that would best tell look-alike mechanisms apart.
 
     SOURCES are those of `bayeskin diagnose`, which runs first if the diagnosis is not done. The command works
-    for the reaction only, because no other protocol has the article's observation. The set that
-    explains the recording best, and the sets with look-alikes in its place, are taken as equally probable.
-    The reduced model of the device runs draws of their posteriors in other tests. The forces give the
-    expected information, in bits, about which set is true. The command first tries nine variations of the
-    recording's own test, and then changes of the most informative ones. All tests stay within the
-    displacements and speeds that the reduced model was trained for.
+    only for the observation `reaction`, because the article's observation is defined for the article's
+    protocol alone. It compares the set of mechanisms that explains the recording best with the sets in which
+    look-alikes take their place, and takes all of them as equally probable. The reduced model of the device
+    runs draws of their posteriors in other tests. The forces give the expected information, in bits, about
+    which set is true. The command first tries nine variations of the recording's own test, and then changes
+    of the most informative ones. All tests stay within the displacements and speeds that the reduced model
+    was trained for.
 
     \b
     Example:

@@ -21,7 +21,9 @@ from bayeskin.errors import InputError
 @click.option("--time", metavar="COLUMN", help="Name or number of the column of time.")
 @click.option("--displacement", metavar="COLUMN", help="Name or number of the column of displacement.")
 @click.option("--force", metavar="COLUMN", help="Name or number of the column of force.")
-@click.option("--unit", "units", multiple=True, metavar="QUANTITY=UNIT", help="As force=mN; repeatable.")
+@click.option(
+    "--unit", "units", multiple=True, metavar="QUANTITY=UNIT", help="A unit, such as force=mN; repeatable."
+)
 @click.option("--zero/--no-zero", default=None, help="Subtract the first displacement, or keep it.")
 @answered
 def import_(**options: Any) -> Mapping[str, Any]:
@@ -54,12 +56,11 @@ def import_(**options: Any) -> Mapping[str, Any]:
 def new(recordings: tuple[Path, ...], out: Path | None, device: Path | None) -> Mapping[str, Any]:
     """Write a commented configuration for recordings of your own; without any, write the demo's.
 
-    The command reads the recordings and reports what they contain. Several recordings are of one skin. The
-    configuration of a single one uses a shipped surrogate if one was trained on the recording's protocol, and
-    a design of model runs otherwise. Existing files are
-    never overwritten. The demo's recording is written beside its configuration. With --device, the sections
-    [device] and [tissue] of that file are written into the configuration; without it, the article's device
-    and tissue are used.
+    The command reads the recordings and reports what they contain. Several recordings must be of one skin.
+    The configuration of a single one uses a shipped surrogate if one was trained on the recording's protocol,
+    and a design of model runs otherwise. Existing files are never overwritten. The demo's recording is
+    written beside its configuration. With --device, the sections [device] and [tissue] of that file are
+    written into the configuration; without it, the article's device and tissue are used.
 
     \b
     Example:
@@ -74,6 +75,8 @@ def new(recordings: tuple[Path, ...], out: Path | None, device: Path | None) -> 
         return new_config(recordings, out, device)
     if device is not None:
         raise InputError(
-            f"--device {device}", "no recording", "a recording, because the demo uses the article's device"
+            f"--device {device}",
+            "no recording is given",
+            "give one, because the demo uses the article's device, or leave out --device",
         )
     return new_demo(out)

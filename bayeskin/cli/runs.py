@@ -51,6 +51,32 @@ def report(config: Path) -> Mapping[str, Any]:
         return stages.report(config, terminal)
 
 
+@click.command(short_help="Write a run's posterior for other programs: CSV, JSON, FEBio.")
+@config_argument
+@click.option("-o", "out", required=True, type=PATH, help="File to write: .csv, .json or .feb.")
+@answered
+def export(config: Path, out: Path) -> Mapping[str, Any]:
+    """Write the posterior of a run to a file for other programs, in SI units.
+
+    A .csv file has one row for each draw and one column for each parameter. A .json file has a normal
+    distribution that is fitted to the draws (of the logarithms, where the prior is one of the logarithm), the
+    medians, and the constants that the model fixes; it suits codes such as FEniCSx. A .feb file has the
+    materials of both layers for FEBio, at the medians.
+
+    The command runs no stage. Its exit code is 1 if the posterior is not to be trusted; the file then says so
+    too, unless it is a table.
+
+    \b
+    Example:
+      bayeskin export runs/demo.toml -o draws.csv
+      bayeskin export runs/demo.toml -o skin.feb
+    """
+    from bayeskin.workflow.exporting import export as export_posterior
+
+    with Terminal() as terminal:
+        return export_posterior(config, out, terminal)
+
+
 @click.command(short_help="Infer all recordings of a study, and their population.")
 @click.argument("file", type=PATH)
 @scheduler_option

@@ -9,10 +9,10 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 
 DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -22,15 +22,15 @@ class _TimeLeft(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Returns the time left of a task as text."""
-        gained, told_s = task.completed - task.fields["first"], task.fields["told_s"]
-        if gained <= 0 or task.elapsed is None:
-            return Text()
-        left_s = told_s * (1.0 - task.completed) / gained - (task.elapsed - told_s)
-        return Text(f"{timedelta(seconds=max(round(left_s), 0))} left")
+        left_s = task.fields["progress"].left_s(task.get_time())
+        return Text() if left_s is None else Text(f"{timedelta(seconds=round(left_s))} left")
 
 
 class Terminal:
-    """Shows on stderr how a run progresses, with moving bars where stderr is an interactive terminal."""
+    """Shows on stderr how a run progresses, with moving bars where stderr is an interactive terminal.
+
+    If the environment variable `BAYESKIN_PROGRESS` names a file, the progress is also written into it.
+    """
 
     def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console or Console(stderr=True, highlight=False)
@@ -39,13 +39,16 @@ class Terminal:
             BarColumn(16),
             TimeElapsedColumn(),
             _TimeLeft(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[progress].note}"),
         )
         self.bars = Progress(
             *columns, console=self.console, transient=True, disable=not self.console.is_terminal,
             get_time=clock,
         )  # fmt: skip
-        self.tasks: dict[str, Task] = {}
+        from bayeskin.workflow.progress import tasks_for_file
+
+        self._clock, self._tasks = clock, tasks_for_file()
+        self._shown: dict[str, TaskID] = {}
 
     def __enter__(self) -> Terminal:
         self.bars.start()
@@ -60,16 +63,12 @@ class Terminal:
 
     def progress(self, label: str, share: float, note: str = "") -> None:
         """Shows the share of a task that is done; a share that falls starts a new bar for the same task."""
-        task = self.tasks.get(label)
-        if task is None or share < task.completed:
-            if task is not None:
-                self.bars.remove_task(task.id)
-            task_id = self.bars.add_task(label, total=1.0, first=share, told_s=0.0, note=note)
-            task = self.tasks[label] = next(
-                candidate for candidate in self.bars.tasks if candidate.id == task_id
-            )
-        told_s = task.elapsed or 0.0
-        self.bars.update(task.id, completed=share, told_s=told_s, note=note, visible=share < 1.0)
+        task = self._tasks.report(label, share, note, self._clock())
+        if task.began_s == task.told_s:
+            if label in self._shown:
+                self.bars.remove_task(self._shown[label])
+            self._shown[label] = self.bars.add_task(label, total=1.0, progress=task)
+        self.bars.update(self._shown[label], completed=share, progress=task, visible=share < 1.0)
 
 
 def exit_code(call: Callable[[], Any]) -> int:
@@ -86,7 +85,8 @@ def exit_code(call: Callable[[], Any]) -> int:
     except (KeyboardInterrupt, click.Abort):
         return complain("interrupted; run the same command again to continue", INTERRUPTED)
     except OSError as error:
-        return complain(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT)
+        where = f"{error.filename}: " if error.filename else ""
+        return complain(f"{where}{reason_of(error)}", WRONG_INPUT)
 
 
 def complain(message: str, code: int) -> int:

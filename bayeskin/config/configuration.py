@@ -65,24 +65,37 @@ class Config(Section):
     @model_validator(mode="after")
     def _one_recording_or_several(self) -> Config:
         """Refuses a configuration without a recording, and one that has both forms."""
-        expected = "[recording], or two or more [[recordings]]"
+        remedy = "write [recording], or two or more [[recordings]]"
         if self.recording is None and not self.recordings:
-            raise InputError("recording", "nothing", expected)
+            raise InputError("recording", "there is no recording", remedy)
         if self.recording is not None and self.recordings:
-            raise InputError("recordings", "[recording] too", expected)
+            raise InputError("recordings", "[recording] is there too", remedy)
         if len(self.recordings) == 1:
-            raise InputError("recordings", "a single one", expected)
+            raise InputError("recordings", "there is a single recording", remedy)
         stems = [PurePath(recording.file).stem for recording in self.recordings]
         twice = next((stem for stem in stems if stems.count(stem) > 1), None)
         if twice is not None:
-            raise InputError("recordings", f"{twice!r} twice", "files of different names")
+            raise InputError(
+                "recordings", f"{twice!r} is the name of two files", "each file needs a name of its own"
+            )
         if self.recordings and self.fit.windows_s is not None:
-            raise InputError("fit.windows_s", "windows", "none with several recordings")
+            raise InputError(
+                "fit.windows_s",
+                "a configuration of several recordings cannot have windows",
+                "leave out this key",
+            )
         if self.recordings and self.model.spec().formulation.fixed_discretisation:
-            found = f"{self.model.observation!r} with several recordings"
-            raise InputError("model.observation", found, "'reaction'")
+            raise InputError(
+                "model.observation",
+                f"{self.model.observation!r} cannot describe several recordings",
+                "it must be 'reaction'",
+            )
         if self.recordings and self.surrogate.file is not None:
-            raise InputError("surrogate.file", "a value", "none with several recordings")
+            raise InputError(
+                "surrogate.file",
+                "a configuration of several recordings cannot use the file of a surrogate",
+                "leave out this key",
+            )
         return self
 
     @property
@@ -94,7 +107,9 @@ class Config(Section):
         """Returns the recording. Raises InputError, which names `where`, where there are several."""
         if self.recordings:
             raise InputError(
-                f"{where}: recordings", f"{len(self.recordings)} recordings", "a single one for this command"
+                f"{where}: recordings",
+                f"there are {len(self.recordings)} recordings",
+                "this command needs a single recording",
             )
         return self.each_recording[0]
 
@@ -104,20 +119,23 @@ class Config(Section):
         coarse, model = self.design.coarse, self.model
         below = 0 if coarse == "reduced" else coarse
         if below is not None and (model.mesh != "bricks" or below >= model.refinement):
-            found = (
-                f"{coarse} with model.observation {model.observation!r}, model.mesh {model.mesh!r}, "
+            problem = (
+                f"it is {coarse!r} with model.observation {model.observation!r}, model.mesh {model.mesh!r}, "
                 f"model.refinement {model.refinement}"
             )
-            expected = "refinement 1 or more" if coarse == "reduced" else "a higher refinement"
-            raise InputError("design.coarse", found, f"bricks with {expected}")
+            needed = "refinement 1 or more" if coarse == "reduced" else "a higher refinement"
+            raise InputError("design.coarse", problem, f"the model must have bricks with {needed}")
         return self
 
     @model_validator(mode="after")
     def _forward_model_has_no_coarse_model(self) -> Config:
         """Refuses a coarse model where a forward model of the user's own replaces the full model."""
         if self.model.forward is not None and self.design.coarse is not None:
-            expected = "no such line, because it concerns the full model"
-            raise InputError("design.coarse", "a value with model.forward", expected)
+            raise InputError(
+                "design.coarse",
+                "it concerns the full model, which model.forward replaces",
+                "leave out this key",
+            )
         return self
 
     @property
@@ -143,11 +161,16 @@ class Config(Section):
         model, any_device = self.model, self.model.spec().formulation.any_device
         if stated.sd_m and not (any_device and model.mesh == "bricks"):
             name, conflict = next(iter(stated.sd_m)), model.mesh if any_device else model.observation
-            found = f"a mean and an sd, with {conflict!r} in [model]"
-            expected = "a number, or observation 'reaction' on mesh 'bricks'"
-            raise InputError(f"{where}: tissue.{name}m", found, expected)
+            problem = f"{conflict!r} in [model] does not allow a mean and an sd"
+            raise InputError(
+                f"{where}: tissue.{name}m",
+                problem,
+                "give a number, or use observation 'reaction' on mesh 'bricks'",
+            )
         if not any_device and stated != StatedGeometry(Geometry()):
             section = "device" if self.device != DeviceConfig() else "tissue"
-            found = f"settings other than the article's, with observation {model.observation!r}"
-            raise InputError(f"{where}: {section}", found, "observation 'reaction'")
+            problem = f"it differs from the article's, which observation {model.observation!r} needs"
+            raise InputError(
+                f"{where}: {section}", problem, "leave out this section, or use observation 'reaction'"
+            )
         return stated

@@ -19,8 +19,8 @@ from bayeskin.geometry import BOUNDS_MM, ForceOn, Geometry, Guard, moved
 from bayeskin.types import Parameter
 
 EXPECTED = "a TOML file with the sections [device] and [tissue]"
-LARGEST_SD = 1 / 3  # as a share of the mean, so that a normal prior stays away from zero
-REACH = 3.0  # the prior of a length extends so many sd to either side of the mean
+LARGEST_SD = 1 / 3  # largest share of the mean, so that a normal prior stays away from zero
+REACH = 3.0  # number of sd by which the prior of a length extends to either side of the mean
 # Relative distance of a length's bounds from impossible lengths, because derivatives take small steps.
 ROOM = 1e-3
 _MEANING = {
@@ -154,13 +154,13 @@ def stated_geometry(device: DeviceConfig, tissue: TissueConfig, where: object) -
             arm_radius_m=None if radius == "flat" else _metres(radius),
         )
     except InputError as error:
-        raise InputError(f"{where}: {_KEYS[error.where]}", error.found, error.expected) from None
+        raise InputError(f"{where}: {_KEYS[error.where]}", error.problem, error.remedy) from None
     sd_m = {}
     for name, value in tissue:
         if isinstance(value, Uncertain):
             if value.sd > LARGEST_SD * value.mean:
-                found = f"sd {value.sd:g} of a mean of {value.mean:g} mm"
-                raise InputError(f"{where}: tissue.{name}", found, "an sd of at most a third of the mean")
+                problem = f"an sd of {value.sd:g} mm is too large for a mean of {value.mean:g} mm"
+                raise InputError(f"{where}: tissue.{name}", problem, "it must be at most a third of the mean")
             sd_m[name.removesuffix("m")] = _metres(value.sd)
     return StatedGeometry(geometry, sd_m)
 

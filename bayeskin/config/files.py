@@ -27,7 +27,7 @@ def load_config(path: Path | str) -> Config:
 
 
 def config_of(plain: Mapping[str, Any], where: Path | str) -> Config:
-    """Checks the sections of a configuration. Raises InputError as `load_config`, which names `where`."""
+    """Returns a checked configuration. Raises InputError, which names `where`, as `load_config` does."""
     config = checked(Config, plain, where, EXPECTED)
     parameter_space(config, where)
     config.geometry(where)

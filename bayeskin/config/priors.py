@@ -37,7 +37,7 @@ def parameter_space(config: Config, where: object = "configuration") -> Paramete
     try:
         return replace(space, correlations=correlations)
     except InputError as error:
-        raise InputError(f"{where}: {error.where}", error.found, error.expected) from None
+        raise InputError(f"{where}: {error.where}", error.problem, error.remedy) from None
 
 
 def _further_initial_pressures(config: Config, space: ParameterSpace) -> list[Parameter]:
@@ -57,7 +57,7 @@ def _space_of_full_model(config: Config, where: object) -> ParameterSpace:
     unknown = sorted(set(config.parameters) - set(default.names))
     if unknown:
         where = f"{where}: parameters.{unknown[0]}"
-        raise InputError(where, "an unknown parameter", one_of(default.names))
+        raise InputError(where, "this parameter is not known", f"use {one_of(default.names)}")
     space = ParameterSpace(
         tuple(_overridden(p, config.parameters.get(p.name), where) for p in default.parameters)
     )
@@ -76,8 +76,8 @@ def _check_lengths(space: ParameterSpace, geometry: Geometry, where: object) -> 
             moved(geometry, corner)
         except InputError as error:
             p = next((p for p in lengths if p.name == error.where), lengths[0])
-            found = f"{1e3 * p.lower:g} to {1e3 * p.upper:g} mm"
-            raise InputError(f"{where}: parameters.{p.name}", found, error.expected) from None
+            problem = f"its prior reaches from {1e3 * p.lower:g} to {1e3 * p.upper:g} mm, too far"
+            raise InputError(f"{where}: parameters.{p.name}", problem, error.remedy) from None
 
 
 def _space_of_forward_model(config: Config, where: object) -> ParameterSpace:
@@ -93,7 +93,9 @@ def _space_of_forward_model(config: Config, where: object) -> ParameterSpace:
         for key in ("lower", "upper"):
             if getattr(prior, key) is None:
                 at = f"{where}: parameters.{name}.{key}"
-                raise InputError(at, "nothing", "a bound, because model.forward is set")
+                raise InputError(
+                    at, "there is no value", "a forward model of your own needs both bounds of each parameter"
+                )
         blank = Parameter(name, prior.unit or "", 0.0, 0.0, "uniform")
         parameters.append(_overridden(blank, prior, where))
     return ParameterSpace(tuple(parameters))
@@ -104,21 +106,31 @@ def _overridden(default: Parameter, change: PriorConfig | None, where: object) -
     if change is None:
         return default
     if change.unit not in (None, default.unit):
-        raise InputError(f"{where}: parameters.{default.name}.unit", repr(change.unit), repr(default.unit))
+        raise InputError(
+            f"{where}: parameters.{default.name}.unit",
+            f"{change.unit!r} is not the unit of this parameter",
+            f"it must be {default.unit!r}",
+        )
     lower = default.lower if change.lower is None else change.lower
     upper = default.upper if change.upper is None else change.upper
     prior = change.prior or default.prior
     at = f"{where}: parameters.{default.name}"
     if not lower < upper:
-        raise InputError(at, f"lower {lower:g}, upper {upper:g} {default.unit}", "lower below upper")
+        raise InputError(
+            at,
+            f"the lower bound {lower:g} is not below the upper bound {upper:g} {default.unit}",
+            "change one of them",
+        )
     if prior.startswith("log") and lower <= 0:
-        raise InputError(f"{at}.lower", f"{lower:g} with a {prior} prior", "a bound above zero")
+        raise InputError(
+            f"{at}.lower", f"a {prior} prior cannot begin at {lower:g}", "the bound must be above zero"
+        )
     centre, spread = change.centre_and_spread if change.prior else (default.centre, default.spread)
     if prior.endswith("normal") and not lower <= centre <= upper:
         raise InputError(
             at,
-            f"a prior centred at {centre:g} {default.unit}",
-            f"{lower:g} to {upper:g}, the bounds of the parameter",
+            f"the prior is centred at {centre:g} {default.unit}",
+            f"the centre must lie within the bounds, {lower:g} to {upper:g}",
         )
     return replace(
         default, lower=lower, upper=upper, prior=prior, source=change.source, centre=centre, spread=spread

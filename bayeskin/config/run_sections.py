@@ -44,7 +44,7 @@ class ModelConfig(Section):
 
     observation: Observation = "reaction"
     mesh: str = "bricks"
-    refinement: Refinement = 1  # of the bricks, towards the edges of the pads; 0 gives 80 bricks
+    refinement: Refinement = 1  # fineness of the bricks at the pads' edges; 0 gives 80 bricks
     forward: str | None = None
 
     @model_validator(mode="before")
@@ -57,7 +57,8 @@ class ModelConfig(Section):
     def _observation_own_needs_a_forward_model(self) -> ModelConfig:
         """Refuses the observation "own" without a forward model, and another observation with it."""
         if (self.observation == "own") != (self.forward is not None):
-            raise InputError("observation", repr(self.observation), "'own' with model.forward, and only then")
+            problem = f"{self.observation!r} is given with{'out' * (self.forward is None)} model.forward"
+            raise InputError("observation", problem, "it must be 'own' with model.forward, and only then")
         return self
 
     def spec(self) -> ModelSpec:
@@ -96,9 +97,12 @@ class PriorConfig(Section):
         given = {name for name in ("mean", "sd", "median", "factor") if getattr(self, name) is not None}
         needed = {"normal": {"mean", "sd"}, "log-normal": {"median", "factor"}}.get(self.prior or "", set())
         if given != needed:
-            found = ", ".join(sorted(given)) or "none of its numbers"
-            expected = f"{' and '.join(sorted(needed))}" if needed else "them only with a normal prior"
-            raise InputError("prior", found, expected)
+            problem = (
+                f"a {self.prior or 'default'} prior is given with {', '.join(sorted(given)) or 'no number'}"
+            )
+            needs = f"it needs {' and '.join(sorted(needed))}"
+            remedy = needs if needed else "only a normal or log-normal prior has such numbers"
+            raise InputError("prior", problem, remedy)
         return self
 
     @property
@@ -173,10 +177,14 @@ class FitConfig(Section):
     def _windows_start_before_they_end(self) -> FitConfig:
         """Refuses an empty list of windows, and a window that does not start before it ends."""
         if self.windows_s is not None and not self.windows_s:
-            raise InputError("windows_s", "an empty list", "at least one [start, end]")
+            raise InputError("windows_s", "the list is empty", "it needs at least one window [start, end]")
         for start, end in self.windows_s or ():
             if not start < end:
-                raise InputError("windows_s", f"[{start:g}, {end:g}]", "start below end")
+                raise InputError(
+                    "windows_s",
+                    f"the window [{start:g}, {end:g}] does not start before it ends",
+                    "write it as [start, end]",
+                )
         return self
 
 
@@ -192,8 +200,11 @@ class NoiseConfig(Section):
         """Refuses bounds that are not ascending or not positive."""
         for name, bounds in self:
             if bounds is not None and not 0 < bounds[0] < bounds[1]:
-                found = f"[{bounds[0]:g}, {bounds[1]:g}]"
-                raise InputError(name, found, "lower below upper, both above zero")
+                raise InputError(
+                    name,
+                    f"the bounds are [{bounds[0]:g}, {bounds[1]:g}]",
+                    "the lower bound must be below the upper, and both above zero",
+                )
         return self
 
 
@@ -216,7 +227,11 @@ class CheckConfig(Section):
     def _very_few_draws_are_refused(self) -> CheckConfig:
         """Refuses numbers of draws whose importance weights carry almost no information."""
         if 0 < self.draws < FEWEST_CHECKED:
-            raise InputError("draws", self.draws, f"0 for none, or at least {FEWEST_CHECKED}")
+            raise InputError(
+                "draws",
+                f"{self.draws} draws are too few",
+                f"use 0 for no check, or at least {FEWEST_CHECKED}",
+            )
         return self
 
 

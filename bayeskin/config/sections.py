@@ -14,7 +14,7 @@ from bayeskin.errors import InputError
 from bayeskin.probe import bytes_of
 
 MOST_BYTES = 1_000_000
-TOO_DEEP = "tables or lists that are nested too deeply"
+TOO_DEEP = "its tables or lists are nested too deeply"
 
 
 class Section(BaseModel):
@@ -32,11 +32,11 @@ def read_toml(path: Path, expected: str) -> dict[str, Any]:
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError:
-        raise InputError(path, "bytes that are not text in UTF-8", expected) from None
+        raise InputError(path, "this file is not text in UTF-8", f"bayeskin needs {expected}") from None
     except RecursionError:
-        raise InputError(path, TOO_DEEP, expected) from None
+        raise InputError(path, TOO_DEEP, f"bayeskin needs {expected}") from None
     except ValueError as error:  # from the TOML reader, or for a number with thousands of digits
-        raise InputError(path, str(error), expected) from None
+        raise InputError(path, f"this file is not TOML ({error})", f"bayeskin needs {expected}") from None
 
 
 def checked(kind: type[Checked], plain: Mapping[str, Any], where: Path | str, expected: str) -> Checked:
@@ -46,9 +46,11 @@ def checked(kind: type[Checked], plain: Mapping[str, Any], where: Path | str, ex
     except ValidationError as error:
         raise _input_error(where, error, kind) from None
     except RecursionError:
-        raise InputError(where, TOO_DEEP, expected) from None
+        raise InputError(where, TOO_DEEP, f"bayeskin needs {expected}") from None
     except ValueError as error:  # for a number with thousands of digits
-        raise InputError(where, str(error), expected) from None
+        raise InputError(
+            where, f"its values cannot be read ({error})", f"bayeskin needs {expected}"
+        ) from None
 
 
 def _input_error(path: Path | str, complaint: ValidationError, root: type[Section]) -> InputError:
@@ -57,23 +59,31 @@ def _input_error(path: Path | str, complaint: ValidationError, root: type[Sectio
     key = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))  # no tags
     kind, given = first["type"], first["input"]
     if kind == "extra_forbidden":
-        return InputError(f"{path}: {key}", "an unknown key", one_of(_keys_beside(root, first["loc"])))
+        return InputError(
+            f"{path}: {key}", "this key is not known", f"use {one_of(_keys_beside(root, first['loc']))}"
+        )
     if kind == "missing" and isinstance(first["loc"][-1], int):
-        return InputError(f"{path}: {key}", "nothing", "one more entry")
+        return InputError(f"{path}: {key}", "this entry is missing", "the list needs it")
     if kind == "missing":
-        return InputError(f"{path}: {key}", "nothing", "a value, because this key has no default")
+        return InputError(f"{path}: {key}", "there is no value", "give one, because this key has no default")
     if kind == "value_error":
         error = first["ctx"]["error"]
         assert isinstance(error, InputError)  # the checks of this package raise no other
         where = f"{key}.{error.where}" if key else error.where
-        return InputError(f"{path}: {where}", error.found, error.expected)
-    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
+        return InputError(f"{path}: {where}", error.problem, error.remedy)
+    text = first["msg"].replace("False", "false")  # as TOML writes it
+    _, should, rule = text.rpartition(" should ")  # as in "Input should be greater than 0"
+    remedy = f"it must {rule}" if should else rule[:1].lower() + rule[1:]
     if kind in ("model_type", "model_attributes_type", "dict_type"):
-        expected = "a table"
+        remedy = "it must be a table"
+    elif kind in ("list_type", "tuple_type"):
+        remedy = "it must be a list"
     elif kind == "too_long":
-        expected = f"at most {first['ctx']['max_length']} entries"
+        remedy = f"the number of entries must be at most {first['ctx']['max_length']}"
+    elif kind == "too_short":
+        remedy = f"the number of entries must be at least {first['ctx']['min_length']}"
     given_text = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
-    return InputError(f"{path}: {key}", given_text, expected[0].lower() + expected[1:])
+    return InputError(f"{path}: {key}", f"{given_text} is not allowed", remedy)
 
 
 def _keys_beside(root: type[Section], location: tuple[Any, ...]) -> tuple[str, ...]:

@@ -52,8 +52,10 @@ class StudyFile:
         settings = self._moved(folder) | {"name": name}
         if device is not None:
             if stated := {"device", "tissue"} & settings.keys():
-                expected = f"no such column, because {self.path} has the section [{min(stated)}]"
-                raise InputError(f"{self.table}, column 'device'", str(device), expected)
+                problem = f"{device} is named here, and {self.path} has the section [{min(stated)}]"
+                raise InputError(
+                    f"{self.table}, column 'device'", problem, "leave out the column or the section"
+                )
             settings |= {key: section.model_dump() for key, section in load_device_file(device)}
         for key, own in {"recording": {"file": self._from(folder, recording)}, **sections}.items():
             settings[key] = {**settings.get(key, {}), **own}
@@ -85,13 +87,21 @@ def load_study(path: Path | str) -> StudyFile:
     settings = {"name": path.stem, **read_toml(path, EXPECTED)}
     table = settings.pop("table", None)
     if not isinstance(table, str):
-        found = "nothing" if table is None else repr(table)[:80]
-        raise InputError(f"{path}: table", found, "the name of a CSV file with the study's recordings")
+        problem = "there is no table" if table is None else f"{table!r:.80} is not the name of a file"
+        raise InputError(f"{path}: table", problem, "give the name of a CSV file with the study's recordings")
     named = settings.get("recording", {})
     if "recordings" in settings or (isinstance(named, dict) and "file" in named):
-        raise InputError(f"{path}: recording", "a recording", "none, because the table names them")
+        raise InputError(
+            f"{path}: recording",
+            "a recording is given",
+            "leave it out, because the table names the recordings",
+        )
     if not isinstance(named, dict):
-        raise InputError(f"{path}: recording", repr(named)[:80], "a table")
+        raise InputError(
+            f"{path}: recording",
+            f"{named!r:.80} is not a section",
+            "write a section [recording], or leave it out",
+        )
     config = config_of({**settings, "recording": {**named, "file": table}}, path)
     return StudyFile(path, path.parent / table, settings, config)
 

@@ -29,12 +29,18 @@ def on_scheduler(address: str) -> Iterator[Map]:
     """
     distributed = extra("distributed")
     if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+", address):  # Dask's client would wait and then fail
-        raise InputError(f"scheduler {address}", "no host and port", "the address of a Dask scheduler")
+        raise InputError(
+            f"scheduler {address}",
+            "it has no host and port",
+            "give the address of a Dask scheduler, such as tcp://10.0.0.1:8786",
+        )
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        problem = f"no answer ({type(error).__name__})"
-        raise InputError(f"scheduler {address}", problem, "the address of a Dask scheduler") from None
+        problem = f"it does not answer ({type(error).__name__})"
+        raise InputError(
+            f"scheduler {address}", problem, "give the address of a Dask scheduler that runs"
+        ) from None
     with client:
         yield _map_over(client)
 
@@ -50,7 +56,11 @@ def on_slurm(jobs: int, settings: Mapping[str, Any]) -> Iterator[Map]:
     try:
         cluster = queue.SLURMCluster(cores=1, processes=1, scheduler_options=HIDDEN, **settings)
     except (TypeError, ValueError) as error:
-        raise InputError("slurm", str(error), "settings of dask_jobqueue.SLURMCluster") from None
+        raise InputError(
+            "slurm",
+            f"dask_jobqueue.SLURMCluster refuses these settings ({error})",
+            "its documentation lists the settings",
+        ) from None
     with cluster, distributed.Client(cluster, set_as_default=False) as client:
         cluster.scale(jobs=jobs)
         yield _map_over(client)
@@ -96,5 +106,5 @@ def extra(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise InputError(
-            "cluster", f"no {name} installed", "the packages of `pip install '.[cluster]'`"
+            "cluster", f"the package {name} is not installed", "install it with `pip install '.[cluster]'`"
         ) from None

@@ -135,8 +135,8 @@ def _check_start(false_starts: int, reason: str) -> None:
     if false_starts >= ATTEMPTS:
         raise InputError(
             "worker processes",
-            f"{false_starts} in a row that ended before they started ({reason})",
-            "a model that a fresh interpreter can import, and in a script the guard "
+            f"{false_starts} in a row ended before they started ({reason})",
+            "a fresh interpreter must be able to import the model, and a script needs the guard "
             "`if __name__ == '__main__':`",
         )
 

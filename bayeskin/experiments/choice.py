@@ -85,8 +85,8 @@ def compete(
     """
     fits_of_set = [fit for fit in fits if fit.names == tuple(names)]
     if not fits_of_set:
-        expected = "the fits that `bayeskin diagnose` stores; remove the run's folder `diagnose` to fit again"
-        raise InputError("searches", f"no fit of {', '.join(names) or 'the base model'}", expected)
+        remedy = "remove the run's folder `diagnose`, so that `bayeskin diagnose` makes it"
+        raise InputError("searches", f"there is no fit of {', '.join(names) or 'the base model'}", remedy)
     best = max(fits_of_set, key=weight)
 
     def competes(fit: Fit) -> bool:
@@ -141,7 +141,11 @@ def weigh(
     Raises InputError for fewer than two hypotheses.
     """
     if len(fits) < 2:
-        raise InputError("hypotheses", f"{len(fits)}", "at least two, each with its fit")
+        raise InputError(
+            "hypotheses",
+            f"the number of hypotheses is {len(fits)}",
+            "it must be at least two, each with its fit",
+        )
     draws, motion = settings.draws, protocol.motion
     edges_s = _bin_edges(motion, fits[0], settings.most_bins)
     tasks = [

@@ -184,13 +184,13 @@ def _refuse(forces_n: Sequence[Array], noise: Array, prior: Array, fewest: int) 
     if len(forces_n) < 2 or prior.shape != (len(forces_n),) or not np.all(prior > 0.0):
         raise InputError(
             "hypotheses",
-            f"{len(forces_n)} with probabilities {prior}",
-            "at least two, each with a probability above 0",
+            f"there are {len(forces_n)} with the probabilities {prior}",
+            "there must be at least two, each with a probability above 0",
         )
     for h, forces in enumerate(forces_n):
         if forces.ndim != 2 or len(forces) < fewest or forces.shape[1:] != noise.shape[:1]:
             raise InputError(
                 f"hypothesis {h}",
-                f"forces of shape {forces.shape}",
-                f"at least {fewest} draws on {len(noise)} bins",
+                f"its forces have the shape {forces.shape}",
+                f"there must be at least {fewest} draws on {len(noise)} bins",
             )

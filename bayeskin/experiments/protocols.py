@@ -188,7 +188,7 @@ def own(motion: PadMotion) -> tuple[float, float, float]:
     speed = np.abs(travel) / lasts
     amplitude = float(np.ptp(motion.displacement_m))
     if amplitude <= 0.0:
-        raise InputError("motion", "pads that never move", "at least one ramp")
+        raise InputError("motion", "the pads never move", "it needs at least one ramp")
     moving = speed > PROTOCOLS.moving * speed.max()
     mean_speed = float(np.abs(travel[moving]).sum() / lasts[moving].sum())
     level = 0.5 * (motion.displacement_m[1:] + motion.displacement_m[:-1]) - motion.displacement_m.min()

@@ -95,8 +95,11 @@ def simulate_server(url: str, motion: PadMotion, theta: Mapping[str, float]) -> 
         name = client.name()
         sizes = client.sizes(name, "input", config)
         if sum(sizes) != len(theta):
-            problem = f"a model of {sum(sizes)} inputs"
-            raise InputError(url, problem, f"{len(theta)}: {', '.join(theta)}")
+            raise InputError(
+                url,
+                f"the number of the model's inputs is {sum(sizes)}",
+                f"it must be {len(theta)}: {', '.join(theta)}",
+            )
         values = iter(theta.values())
         answer = client.evaluate(name, [[next(values) for _ in range(size)] for size in sizes], config)
         force_n, message = np.array(answer), ""
@@ -116,8 +119,11 @@ def _simulation(
     message: str = "",
 ) -> Simulation:
     if force_n.shape != time_s.shape:
-        expected = f"shape ({len(time_s)},), one force for each time"
-        raise InputError("your own forward model", f"a force of shape {force_n.shape}", expected)
+        raise InputError(
+            "your own forward model",
+            f"the shape of its forces is {force_n.shape}",
+            f"it must be ({len(time_s)},), one force for each time",
+        )
     if not message and not np.isfinite(force_n).all():
         message = "the force of your own forward model is not finite"
     return Simulation(
@@ -148,8 +154,8 @@ def _source(forward: str) -> Path:
     """Returns the file in which a function is defined. Raises InputError where it cannot be found."""
     place, colon, function = forward.rpartition(":")
     if not colon or not function.isidentifier():
-        expected = "FILE.py:FUNCTION, PACKAGE.MODULE:FUNCTION or http://HOST:PORT"
-        raise InputError("model.forward", repr(forward), expected)
+        remedy = "write FILE.py:FUNCTION, PACKAGE.MODULE:FUNCTION or http://HOST:PORT"
+        raise InputError("model.forward", f"{forward!r} does not name a function", remedy)
     if place.endswith(".py"):
         source = Path(place)
     else:
@@ -159,7 +165,11 @@ def _source(forward: str) -> Path:
             spec = None
         source = Path(spec.origin) if spec is not None and spec.origin else Path(place)
     if not source.is_file():
-        raise InputError(f"model.forward {forward}", f"no file {source}", "a Python file or module")
+        raise InputError(
+            f"model.forward {forward}",
+            f"there is no file {source}",
+            "name a Python file or module that exists",
+        )
     return source
 
 
@@ -173,11 +183,18 @@ def _function(forward: str) -> Force:
     try:
         module = _module_of_file(source) if place.endswith(".py") else importlib.import_module(place)
     except Exception as error:  # the user's file can raise any exception
-        problem = f"{type(error).__name__}: {error}"
-        raise InputError(f"model.forward {source}", problem, "a file that Python can import") from None
+        raise InputError(
+            f"model.forward {source}",
+            f"the file cannot be imported ({type(error).__name__}: {error})",
+            "correct the file so that Python can import it",
+        ) from None
     function: Any = getattr(module, name, None)
     if not callable(function):
-        raise InputError(f"model.forward {source}", f"no function {name}", "FILE.py:FUNCTION")
+        raise InputError(
+            f"model.forward {source}",
+            f"the file has no function {name}",
+            "name one of its functions as FILE.py:FUNCTION",
+        )
     return function  # type: ignore[no-any-return]
 
 

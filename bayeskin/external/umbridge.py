@@ -26,7 +26,7 @@ from bayeskin.errors import InputError, Unavailable
 VERSION = 1.0
 CONNECT_S = 10.0
 MOST_BYTES = 64_000_000  # largest size of a request; a protocol of a million corners takes half of it
-EXPECTED = "a server that speaks UM-Bridge"
+REMEDY = "bayeskin needs a server that speaks UM-Bridge"
 
 Vectors = list[list[float]]
 
@@ -63,11 +63,17 @@ class Client:
         models = self._request("GET", "/Info", None).get("models")
         wanted = urlsplit(self.url).fragment
         if not isinstance(models, list) or not models:
-            raise InputError(self.url, "a server without models", EXPECTED)
+            raise InputError(self.url, "the server has no models", REMEDY)
         if wanted and wanted not in models:
-            raise InputError(self.url, f"no model {wanted!r}", f"one of {', '.join(map(str, models))}")
+            raise InputError(
+                self.url, f"the server has no model {wanted!r}", f"use one of {', '.join(map(str, models))}"
+            )
         if not wanted and len(models) > 1:
-            raise InputError(self.url, "several models", f"#NAME after the URL, one of {', '.join(models)}")
+            raise InputError(
+                self.url,
+                "the server has several models",
+                f"write #NAME after the URL, with one of {', '.join(models)}",
+            )
         return wanted or str(models[0])
 
     def sizes(self, name: str, which: str, config: Mapping[str, Any]) -> list[int]:
@@ -75,7 +81,9 @@ class Client:
         answer = self._request("POST", f"/{which.capitalize()}Sizes", {"name": name, "config": config})
         sizes = answer.get(f"{which}Sizes")
         if not isinstance(sizes, list) or not all(isinstance(size, int) for size in sizes):
-            raise InputError(self.url, f"{which} sizes {sizes!r}", "a list of lengths")
+            raise InputError(
+                self.url, f"the server states the {which} sizes {sizes!r}", "it must state a list of lengths"
+            )
         return sizes
 
     def evaluate(self, name: str, inputs: Vectors, config: Mapping[str, Any]) -> list[float]:
@@ -88,7 +96,7 @@ class Client:
         try:
             return [float(value) for vector in answer["output"] for value in vector]
         except (KeyError, TypeError, ValueError):
-            raise InputError(self.url, "an answer without numbers", "vectors of numbers") from None
+            raise InputError(self.url, "the answer contains no vectors of numbers", REMEDY) from None
 
     def _request(self, method: str, path: str, content: Mapping[str, Any] | None) -> dict[str, Any]:
         parts = _checked_url(self.url)
@@ -102,21 +110,24 @@ class Client:
             connection.request(method, parts.path.rstrip("/") + path, body, headers)
             text = connection.getresponse().read()
         except (OSError, http.client.HTTPException) as error:
-            raise Unavailable(self.url, f"no answer ({error or type(error).__name__})", EXPECTED) from None
+            raise Unavailable(
+                self.url, f"no server answers ({error or type(error).__name__})", REMEDY
+            ) from None
         finally:
             connection.close()
         return parsed_answer(self.url, text)
 
 
 def _checked_url(url: str) -> Any:
-    expected = "http://HOST:PORT or http://HOST:PORT#NAME"
     try:
         parts = urlsplit(url)
         fits = parts.scheme in ("http", "https") and parts.hostname and (parts.port or True)
     except ValueError:  # the port is not a number
         fits = False
     if not fits:
-        raise InputError(url, "an invalid address", expected)
+        raise InputError(
+            url, "this is not a valid address", "write http://HOST:PORT or http://HOST:PORT#NAME"
+        )
     return parts
 
 
@@ -130,7 +141,7 @@ def parsed_answer(url: str, text: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError):
         answer = None
     if not isinstance(answer, dict):
-        raise InputError(url, f"the answer {text[:40]!r}", EXPECTED)
+        raise InputError(url, f"the answer is {text[:40]!r}", REMEDY)
     if "error" in answer:
         error = answer["error"]
         raise Refused(str(error.get("message", error)) if isinstance(error, dict) else str(error))
@@ -146,7 +157,11 @@ def server(model: Model, host: str, port: int) -> ThreadingHTTPServer:
     try:
         return _Server((host, port), handler)
     except (OSError, OverflowError) as error:
-        raise InputError(f"{host}:{port}", str(error), "an address of this machine and a free port") from None
+        raise InputError(
+            f"{host}:{port}",
+            f"a server cannot listen there ({error})",
+            "use an address of this machine and a free port",
+        ) from None
 
 
 class _Server(ThreadingHTTPServer):
@@ -178,7 +193,9 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not (length.isdecimal() and len(length) < 20 and int(length) <= MOST_BYTES):
             self.close_connection = True  # the rest of this request could be mistaken for the next one
-            self._refuse(400, "InvalidInput", f"Content-Length {length!r:.40}; expected at most {MOST_BYTES}")
+            self._refuse(
+                400, "InvalidInput", f"Content-Length is {length!r:.40}; it must be at most {MOST_BYTES}"
+            )
             return
         body = self.rfile.read(int(length))
         try:
@@ -235,9 +252,13 @@ def _vectors(given: Any, sizes: Sequence[int]) -> Vectors:
     """Returns the input vectors. Raises InputError unless they have these sizes and hold finite numbers."""
     fits = isinstance(given, list) and all(isinstance(vector, list) for vector in given)
     if not fits or [len(vector) for vector in given] != list(sizes):
-        lengths = [len(vector) for vector in given] if fits else type(given).__name__
-        raise InputError("input", f"vectors of lengths {lengths}", f"lengths {list(sizes)}")
+        problem = (
+            f"its vectors have the lengths {[len(v) for v in given]}" if fits else "it is no list of lists"
+        )
+        raise InputError("input", problem, f"the lengths must be {list(sizes)}")
     for value in (value for vector in given for value in vector):
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise InputError("input", repr(value), "finite numbers")
+            raise InputError(
+                "input", f"{value!r} is not a finite number", "all values must be finite numbers"
+            )
     return [[float(value) for value in vector] for vector in given]

@@ -12,7 +12,7 @@ from functools import lru_cache
 from importlib import resources
 from typing import NamedTuple
 
-FILE = "discretisation.json"  # in this folder; benchmarks/discretisation_study.py writes it
+FILE = "discretisation.json"  # benchmarks/discretisation_study.py writes it into this folder
 
 
 class MeshError(NamedTuple):

@@ -76,7 +76,9 @@ def brick_lines(
         return tuple(1e-3 * np.array(axis) for axis in _lines_mm(refinement, geometry))
     if (like.along_m, like.across_m) != (geometry.along_m, geometry.across_m):
         raise InputError(
-            "geometry", "other pads or another guard", "the pads and the guard of the reference device"
+            "geometry",
+            "its pads or its guard differ from those of the reference device",
+            "they must be the same",
         )
     x, y, z = _lines_mm(refinement, like)
     old, new = ([0.0, _mm(tissue.subcutis_m), _mm(tissue.thickness_m)] for tissue in (like, geometry))

@@ -50,7 +50,7 @@ class Corrector:
 
     def __init__(self, model: LagrangianModel) -> None:
         self._model = model
-        self._duals: dict[int, tuple[Array, Array]] = {}  # by id of the place, which each entry keeps alive
+        self._duals: dict[int, tuple[Array, Array]] = {}  # keys: id of the place, which the entry keeps alive
 
     def correct(
         self, equations: Equations, action: Callable[[Array], Differentiated], x: Array

@@ -16,12 +16,12 @@ from bayeskin.finite_element.tissue import Bind, TissueLaw
 from bayeskin.types import Array
 
 POINTS = 16
-STEP = 1e-5  # of the differences, relative to the sizes
-NEGLIGIBLE = 1e-2  # of the base law's derivative: a smaller change by the law is compared with this change
+STEP = 1e-5  # step of the differences, relative to the sizes
+NEGLIGIBLE = 1e-2  # share of the base law's derivative that stands for any smaller change by the law
 TIME_S, ELAPSED_S = 1.0, 0.7
 GIVEN = {"F": slice(9), "p": slice(9, 10), "grad p": slice(10, 13)}  # columns of a state (n, 13)
-ANSWERED = {"stress": slice(9), "content": slice(9, 10), "flux": slice(10, 13)}  # of a response (n, 13)
-SIZES = np.array([0.1] * 9 + [1e3] + [1e5] * 3)  # of F - I, p [Pa] and grad p [Pa/m]
+ANSWERED = {"stress": slice(9), "content": slice(9, 10), "flux": slice(10, 13)}  # a response (n, 13)
+SIZES = np.array([0.1] * 9 + [1e3] + [1e5] * 3)  # sizes of F - I, p [Pa] and grad p [Pa/m]
 
 
 def derivative_errors(bind: Bind, values: Mapping[str, float], seed: int = 0) -> dict[str, float]:
@@ -40,8 +40,8 @@ def derivative_errors(bind: Bind, values: Mapping[str, float], seed: int = 0) ->
     after = _response(law, solid, _states(rng), before)[1]
     unfilled = int(np.isnan(after).any(axis=0).sum())
     if law.respond is not None and unfilled:
-        found = f"{unfilled} of {law.remembers} numbers of the memory without a value"
-        raise InputError("respond", found, "all of `after`, at all points")
+        problem = f"it leaves {unfilled} of {law.remembers} numbers of the memory without a value"
+        raise InputError("respond", problem, "it must fill all of `after`, at all points")
     before[::2] = after[::2]
     state, none = _states(rng), TissueLaw()
     base = _derivatives(none, solid, state, before)

@@ -71,7 +71,11 @@ def vary(
     bound = tuple(sorted((bind(values, model.problem.sites) for bind in laws), key=lambda law: law.rank))
     drive = on_the_way(model.protocol, bound)
     if drive.starts_s != model.starts_s:
-        raise InputError(f"gradients: {name}", theta[name], "a run whose pads are opened before the test")
+        raise InputError(
+            f"gradients: {name}",
+            f"a step from {theta[name]} opens the pads before the test",
+            "start from a value with which the run opens them too",
+        )
     return Varied(model, material(values, model.problem.mesh.cutis), bound, drive)
 
 

@@ -42,14 +42,18 @@ def read_gmsh(path: Path | str, geometry: Geometry = Geometry()) -> SkinMesh:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(path, "no such file", "a gmsh mesh")
+        raise InputError(path, "there is no such file", "bayeskin needs a gmsh mesh")
     try:
         with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # meshio prints long warnings
             return _skin_mesh(path, meshio.read(path, file_format="gmsh"), geometry)
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # a damaged file can raise almost any error
-        raise InputError(path, f"not readable as gmsh ({type(error).__name__})", "a gmsh 4.1 mesh") from None
+        raise InputError(
+            path,
+            f"this file cannot be read as gmsh ({type(error).__name__})",
+            "bayeskin needs a gmsh 4.1 mesh",
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -69,10 +73,12 @@ def _skin_mesh(path: Path, raw: meshio.Mesh, geometry: Geometry) -> SkinMesh:
     names = {gmsh: name for gmsh, name in GMSH_NAMES.items() if name != "guard" or geometry.guard is not None}
     missing = [n for n in (*names, *GMSH_LAYERS) if n not in raw.field_data]
     if missing:
-        raise InputError(path, f"no boundary or layer named {', '.join(missing)}", "the article's names")
+        raise InputError(
+            path, f"no boundary or layer is named {', '.join(missing)}", "use the article's names"
+        )
     solid, surface = _cells(raw, "tetra", 4), _cells(raw, "triangle", 3)
     if not len(solid.corners):
-        raise InputError(path, "no tetrahedra", "a volume mesh")
+        raise InputError(path, "the mesh has no tetrahedra", "bayeskin needs the mesh of a volume")
     used, compact = np.unique(solid.corners, return_inverse=True)
     points = np.ascontiguousarray(raw.points[used].T)
     flat = skfem.MeshTet(points, np.ascontiguousarray(compact.reshape(solid.corners.shape).T))
@@ -85,7 +91,7 @@ def _skin_mesh(path: Path, raw: meshio.Mesh, geometry: Geometry) -> SkinMesh:
     for gmsh_name, name in names.items():
         nodes = number[surface.corners[surface.named[gmsh_name]]]
         if not len(nodes):
-            raise InputError(path, f"boundary {gmsh_name} without triangles", "at least one")
+            raise InputError(path, f"the boundary {gmsh_name} has no triangles", "it needs at least one")
         _check_boundary(f"{path}: {gmsh_name}", points[:, nodes.ravel()], name, geometry)
         facets[name] = _facet_indices(flat, nodes)
     rolled = skfem.MeshTet(roll(flat.p, geometry.arm_radius_m), flat.t)
@@ -117,8 +123,10 @@ def _check_units(path: Path, points: Array) -> None:
     """Raises InputError if the coordinates (3, n) look like millimetres."""
     longest_m = float(np.ptp(points, axis=1).max())
     if longest_m > LONGEST_M:
-        expected = "coordinates in metres (in gmsh: Mesh.ScalingFactor = 0.001 before it is saved)"
-        raise InputError(path, f"a length of {longest_m:g}, probably in millimetres", expected)
+        remedy = "give coordinates in metres (in gmsh: Mesh.ScalingFactor = 0.001 before it is saved)"
+        raise InputError(
+            path, f"the mesh has a length of {longest_m:g}, so its unit is probably millimetres", remedy
+        )
 
 
 def _check_layers(path: Path, points: Array, cells: np.ndarray, solid: _Cells, geometry: Geometry) -> None:
@@ -126,12 +134,15 @@ def _check_layers(path: Path, points: Array, cells: np.ndarray, solid: _Cells, g
     layers = [solid.named[name] for name in GMSH_LAYERS]
     stray = int(np.sum(layers[0] == layers[1]))
     if stray:
-        message = f"{stray} tetrahedra in no layer or in both layers"
-        raise InputError(path, message, f"each in one of {', '.join(GMSH_LAYERS)}")
+        raise InputError(
+            path,
+            f"{stray} tetrahedra belong to no layer or to both layers",
+            f"each must belong to one of {', '.join(GMSH_LAYERS)}",
+        )
     depths = (0.0, geometry.subcutis_m), (geometry.subcutis_m, geometry.thickness_m)
     for name, inside, depth in zip(GMSH_LAYERS, layers, depths, strict=True):
         if not inside.any():
-            raise InputError(path, f"layer {name} without tetrahedra", "at least one")
+            raise InputError(path, f"the layer {name} has no tetrahedra", "it needs at least one")
         _check_extent(f"{path}: {name}", points[2, cells[:, inside]], "z", depth, DEPTH_TOLERANCE_M)
 
 
@@ -139,10 +150,14 @@ def _check_guard(path: Path, surface: _Cells, geometry: Geometry) -> None:
     """Raises InputError if the device has no guard but the mesh does, or if guard and pad share triangles."""
     guard = surface.named.get("u_right", np.empty(0, bool))
     if geometry.guard is None and guard.any():
-        raise InputError(f"{path}: u_right", "a guard", "no guard, because this device has none")
+        raise InputError(
+            f"{path}: u_right", "the mesh has a guard", "remove it, because this device has none"
+        )
     if geometry.guard is not None and (guard & surface.named["right_patch"]).any():
         raise InputError(
-            f"{path}: u_right", "triangles that also belong to right_patch", "separate pad and guard"
+            f"{path}: u_right",
+            "some of its triangles also belong to right_patch",
+            "pad and guard must be separate",
         )
 
 
@@ -162,13 +177,15 @@ def _check_boundary(where: str, points: Array, name: str, geometry: Geometry) ->
 
 
 def _check_extent(
-    where: str, found_m: Array, axis: str, expected_m: tuple[float, ...], tolerance_m: float
+    where: str, coordinates_m: Array, axis: str, required_m: tuple[float, ...], tolerance_m: float
 ) -> None:
     """Raises InputError unless the coordinates along an axis extend over the expected interval."""
-    ends = float(found_m.min()), float(found_m.max())
-    if not np.allclose(ends, expected_m, rtol=0.0, atol=tolerance_m):
-        measured, expected = (f"{axis} {1e3 * a:.4g} to {1e3 * b:.4g} mm" for a, b in (ends, expected_m))
-        raise InputError(where, measured, f"{expected}, as the device and the tissue require")
+    ends = float(coordinates_m.min()), float(coordinates_m.max())
+    if not np.allclose(ends, required_m, rtol=0.0, atol=tolerance_m):
+        measured, required = (f"{axis} {1e3 * a:.4g} to {1e3 * b:.4g} mm" for a, b in (ends, required_m))
+        raise InputError(
+            where, f"the mesh extends over {measured}", f"the device and the tissue require {required}"
+        )
 
 
 def _facet_indices(mesh: skfem.Mesh, nodes: np.ndarray) -> np.ndarray:

@@ -84,7 +84,9 @@ class ForceGradients:
     ) -> None:  # fmt: skip
         unknown = [name for name in changes if name not in theta]
         if unknown:
-            raise InputError("gradients", unknown[0], f"one of {', '.join(theta)}")
+            raise InputError(
+                "gradients", f"{unknown[0]} is not a parameter of the run", f"use some of {', '.join(theta)}"
+            )
         self.names = tuple(changes)
         self._model, self._follows = model, _scaling_rule(model, theta, changes)
         self._solved = tuple(name for name in changes if not (self._follows and name == "E_c"))
@@ -100,7 +102,7 @@ class ForceGradients:
         self._in_series = bool(model.drive.elements)
         self._reach_m = 2.0 * model.drive.largest_m
         self._start = self._at_rest(theta["p_init"], changes.get("p_init", 0.0))
-        self._known: dict[int, Slopes] = {}  # by id of the state, which each entry keeps alive
+        self._known: dict[int, Slopes] = {}  # keys: id of the state, which the entry keeps alive
         self._phase: list[Slopes] = [self._start]  # derivatives at the ends of this phase's stages
         self._travel: Array | None = None
         self._corrector = Corrector(model)

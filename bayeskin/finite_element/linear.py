@@ -179,7 +179,9 @@ class SuperLU(Factorisations):
 
     @property
     def bytes_each(self) -> int:
-        return 12 * max((factors.nnz for factors, _ in self._stored.values()), default=0)  # with indices
+        return 12 * max(
+            (factors.nnz for factors, _ in self._stored.values()), default=0
+        )  # each entry with its index
 
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
         diagonal = sp.diags(scale)

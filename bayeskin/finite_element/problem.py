@@ -55,7 +55,7 @@ def material(theta: Mapping[str, float], cutis: np.ndarray, fixed: Constants | N
     ratios = [theta.get(name, getattr(c, name)) for name in ("nu_c", "nu_s")]
     for name, ratio in zip(("nu_c", "nu_s"), ratios, strict=True):
         if not -1.0 < ratio < 0.5:
-            raise InputError(f"parameters: {name}", f"{ratio:g}", "a number above -1 and below 0.5")
+            raise InputError(f"parameters: {name}", f"it is {ratio:g}", "it must lie above -1 and below 0.5")
 
     def by_layer(in_cutis: float, in_subcutis: float) -> Array:
         return np.where(cutis, in_cutis, in_subcutis).astype(float)

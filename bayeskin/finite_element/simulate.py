@@ -61,14 +61,22 @@ class ModelSpec:
     def __post_init__(self) -> None:
         if (self.observation == "own") != (self.forward is not None):
             raise InputError(
-                "model.forward", self.forward, "a forward model if the observation is 'own', and only then"
+                "model.forward",
+                f"it is {self.forward!r} with observation {self.observation!r}",
+                "the observation 'own' needs a forward model, and no other has any",
             )
         if self.formulation.fixed_discretisation and self.mesh == "bricks":
-            expected = f"the article's gmsh mesh for observation {self.observation!r}"
-            raise InputError("model.mesh", "'bricks'", expected)
+            raise InputError(
+                "model.mesh",
+                "it is 'bricks'",
+                f"observation {self.observation!r} needs the article's gmsh mesh",
+            )
         if not self.formulation.any_device and self.geometry != Geometry():
-            given = f"settings other than the article's, with observation {self.observation!r}"
-            raise InputError("geometry", given, "observation 'reaction', or the article's device and tissue")
+            raise InputError(
+                "geometry",
+                f"it is not the article's, which observation {self.observation!r} needs",
+                "use observation 'reaction', or the article's device and tissue",
+            )
 
     @property
     def formulation(self) -> Formulation:
@@ -115,7 +123,11 @@ def problem_at(spec: ModelSpec, theta: Mapping[str, float]) -> Problem:
     if geometry == spec.geometry:
         return nominal
     if spec.mesh != "bricks":
-        raise InputError("model.mesh", f"{spec.mesh!r} with changed lengths of the tissue", "'bricks'")
+        raise InputError(
+            "model.mesh",
+            f"the nodes of {spec.mesh!r} cannot be moved to changed lengths of the tissue",
+            "use 'bricks'",
+        )
     return moved_problem(nominal, brick_mesh(spec.refinement, geometry, spec.geometry))
 
 
@@ -151,9 +163,15 @@ def simulate(
     if not formulation.any_parameters:
         _check_parameters(theta, bool(laws))
     if gradients and not formulation.differentiable:
-        raise InputError("gradients", f"observation {spec.observation!r}", "observation 'reaction'")
+        raise InputError(
+            "gradients", f"observation {spec.observation!r} has no derivatives", "use observation 'reaction'"
+        )
     if laws and not formulation.takes_laws:
-        raise InputError("tissue mechanisms", f"observation {spec.observation!r}", "observation 'reaction'")
+        raise InputError(
+            "tissue mechanisms",
+            f"observation {spec.observation!r} takes no mechanisms",
+            "use observation 'reaction'",
+        )
     return formulation.run(
         RunRequest(
             motion, theta, partial(problem_at, spec), spec.hash, on_progress, on_state, gradients, laws,
@@ -188,15 +206,15 @@ def _check_parameters(theta: Mapping[str, float], more: bool) -> None:
     """
     for name in PARAMETERS:
         if name not in theta:
-            raise InputError("parameters", f"no {name}", f"all of {', '.join(PARAMETERS)}")
+            raise InputError("parameters", f"{name} is missing", f"all of {', '.join(PARAMETERS)} are needed")
         value = theta[name]
         if not np.isfinite(value) or (name != "p_init" and value <= 0):
-            raise InputError(f"parameters: {name}", value, "a finite positive number")
+            raise InputError(f"parameters: {name}", f"it is {value}", "it must be a finite positive number")
     for name, value in theta.items():
         if not np.isfinite(value):
-            raise InputError(f"parameters: {name}", value, "a finite number")
+            raise InputError(f"parameters: {name}", f"it is {value}", "it must be a finite number")
         if name not in (*PARAMETERS, *LENGTHS) and not more:
-            raise InputError("parameters", name, f"one of {', '.join(PARAMETERS)}")
+            raise InputError("parameters", f"{name} is not known", f"use only {', '.join(PARAMETERS)}")
 
 
 __all__ = ["SOLVER_NAME", "ModelSpec", "OnState", "problem_at", "problem_of", "simulate", "simulate_on"]

@@ -15,7 +15,7 @@ from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.types import Array, PadMotion, Simulation
 from bayeskin.types.joint import edges_of, end_to_end, values_in
 
-BESIDE = 1e-4  # of a change; distance from a neutral value at which derivatives are computed
+BESIDE = 1e-4  # relative distance from a neutral value at which derivatives are computed
 
 
 def reported(

@@ -26,6 +26,7 @@ from bayeskin.inference.inference_data import (
 )
 from bayeskin.inference.lengths import DueToLengths, due_to_lengths
 from bayeskin.inference.noise_model import NoisePriors
+from bayeskin.inference.normal import FittedNormal, fitted_normal
 from bayeskin.inference.optimise import MapResult, StartResult, find_map
 from bayeskin.inference.polish import Polished, polish_map
 from bayeskin.inference.problem import LogPosterior
@@ -38,6 +39,7 @@ __all__ = [
     "Convergence",
     "Corrected",
     "DueToLengths",
+    "FittedNormal",
     "ForceDraws",
     "Identifiability",
     "KindCheck",
@@ -68,6 +70,7 @@ __all__ = [
     "due_to_lengths",
     "evenly",
     "find_map",
+    "fitted_normal",
     "identifiability",
     "load_chains",
     "load_inference_data",

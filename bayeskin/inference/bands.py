@@ -68,7 +68,7 @@ class Bands(FreezesArrays):
         Raises InputError for another level.
         """
         if level not in (0.5, 0.9):
-            raise InputError("level of the band", level, "0.5 or 0.9")
+            raise InputError("level of the band", f"{level} is not known", "use 0.5 or 0.9")
         low, high = (1, 3) if level == 0.5 else (0, 4)
         return self.quantiles_n[low], self.quantiles_n[high]
 

@@ -54,13 +54,16 @@ def load(path: Path, names: tuple[str, ...], identity: Mapping[str, str]) -> emc
         stored = json.loads(handle["mcmc"].attrs["bayeskin"])
         stored_names, stored_identity = tuple(map(str, stored["names"])), dict(stored["identity"])
         if stored_names != names:
-            raise InputError(path, f"a chain of {', '.join(stored_names)}", f"a chain of {', '.join(names)}")
+            raise InputError(
+                path,
+                f"this chain has the parameters {', '.join(stored_names)}",
+                f"they must be {', '.join(names)}",
+            )
         for entry, value in identity.items():
             if stored_identity.get(entry) != value:
-                raise InputError(
-                    path, f"a chain of different input: {entry} {stored_identity.get(entry, 'none')!s:.12}",
-                    f"{entry} {value[:12]}; use another folder for this sampling",
-                )  # fmt: skip
+                stored_value = f"{stored_identity.get(entry, 'none')!s:.12}"
+                problem = f"this chain has other inputs (its {entry} is {stored_value}, not {value[:12]})"
+                raise InputError(path, problem, "use another folder for this sampling")
         return _in_memory(emcee.backends.HDFBackend(str(path), read_only=True), len(names))
 
 
@@ -79,7 +82,9 @@ def _in_memory(disk: emcee.backends.HDFBackend, count: int) -> emcee.backends.Ba
     steps = (memory.iteration, walkers, count)
     if dim != count or (memory.chain.shape, memory.log_prob.shape) != (steps, steps[:2]):
         raise InputError(
-            "chain", f"shape {memory.chain.shape}", f"shape {steps}, and shape {steps[:2]} for log_prob"
+            "chain",
+            f"its shape is {memory.chain.shape}",
+            f"it must be {steps}, and that of log_prob {steps[:2]}",
         )
     memory.random_state = tuple(
         part.item() if isinstance(part, np.generic) else part for part in disk.random_state

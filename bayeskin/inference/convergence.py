@@ -2,9 +2,9 @@
 
 The walkers of one ensemble are coupled, so a single walker does not count as a chain. The autocorrelation
 time of an ensemble comes from the mean autocorrelation of its walkers (Goodman & Weare 2010). R-hat compares
-ensembles, which share nothing but the target density. Each half of each ensemble's run is one chain of nearly
-independent draws: its walkers are pooled and thinned by the autocorrelation time. R-hat is rank-normalised,
-and the larger of bulk and folded (Vehtari et al. 2021, Bayesian Analysis 16:667).
+the ensembles, which have the target density and the proposals in common. Each half of each ensemble's run is
+one chain of nearly independent draws: its walkers are pooled and thinned by the autocorrelation time. R-hat
+is rank-normalised, and the larger of bulk and folded (Vehtari et al. 2021, Bayesian Analysis 16:667).
 """
 
 from __future__ import annotations

@@ -116,7 +116,9 @@ def initial_walkers(
         if len(out) >= walkers:
             return out[:walkers]
     raise InputError(
-        "start", "a density of zero at nearly all points of the prior", "a surrogate with finite values"
+        "start",
+        "the posterior density is zero at nearly all points of the prior",
+        "the surrogate must give finite values there",
     )
 
 

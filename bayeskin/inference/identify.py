@@ -59,6 +59,13 @@ _OUTCOMES = {
 }
 
 
+def grade_of(contraction: float, settings: IdentifiabilitySettings = IdentifiabilitySettings()) -> Informed:
+    """Returns the grade of a parameter by its contraction alone, where there are no draws."""
+    if contraction < settings.nothing_contraction:
+        return Informed.NOT
+    return Informed.WEAKLY if contraction < settings.weak else Informed.WELL
+
+
 @dataclass(frozen=True)
 class Learned:
     """The information about one parameter that the posterior has gained over the prior.

@@ -26,7 +26,7 @@ from bayeskin.types import Array, FreezesArrays, ParameterSpace
 class WeightSettings:
     """Settings of importance weights and of their verdict.
 
-    smoothed_from : number of draws from which on the weights are smoothed
+    smoothed_from : smallest number of draws whose weights are smoothed
     khat : largest k-hat with which sums of the weights are reliable (Vehtari et al. 2024)
     effective_share : share of effective draws below which the surrogate's posterior counts as different
     """

@@ -95,9 +95,15 @@ def load_inference_data(path: Path | str) -> arviz.InferenceData:
     try:
         idata = az.from_netcdf(str(path), engine=_ENGINE)
     except Exception as error:  # h5netcdf and xarray raise many kinds of error on a damaged file
-        raise InputError(path, f"a file that cannot be read ({in_a_line(error)})", expected) from None
+        raise InputError(
+            path, f"this file cannot be read ({in_a_line(error)})", f"bayeskin needs {expected}"
+        ) from None
     if "posterior" not in idata.groups():
-        raise InputError(path, f"the groups {', '.join(idata.groups()) or 'none'}", "a group 'posterior'")
+        raise InputError(
+            path,
+            f"it contains {', '.join(idata.groups()) or 'nothing'}, and no group 'posterior'",
+            f"bayeskin needs {expected}",
+        )
     return idata
 
 
@@ -106,10 +112,10 @@ def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
 
     Raises InputError for an InferenceData of another origin, or where its parts do not belong together.
     """
-    where, expected = "InferenceData", "InferenceData that bayeskin made"
+    where, remedy = "InferenceData", "use InferenceData that bayeskin made"
     stored = idata.attrs.get("parameters")
     if stored is None:
-        raise InputError(where, "no attribute 'parameters'", expected)
+        raise InputError(where, "it has no attribute 'parameters'", remedy)
     try:
         tied = tuple(Correlation(*entry) for entry in json.loads(idata.attrs.get("correlations", "[]")))
         parameters = tuple(checked(Parameter(**entry), where) for entry in json.loads(stored))
@@ -118,9 +124,9 @@ def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
     except InputError:
         raise
     except Exception as error:  # json, xarray and numpy raise many kinds of error on altered contents
-        raise InputError(where, f"contents that cannot be read ({in_a_line(error)})", expected) from None
+        raise InputError(where, f"its contents cannot be read ({in_a_line(error)})", remedy) from None
     if draws.dtype.kind != "f" or not np.isfinite(draws).all():
-        raise InputError(f"{where}: posterior", "draws that are not finite numbers", expected)
+        raise InputError(f"{where}: posterior", "some draws are not finite numbers", remedy)
     return space, draws
 
 

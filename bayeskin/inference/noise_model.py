@@ -110,7 +110,9 @@ def bins_in_windows(binned: BinnedForce, windows: Windows | None) -> NDArray[np.
     for index, (start, end) in enumerate(windows):
         if not (last <= start < end):
             raise InputError(
-                f"fit window {index}", f"{start}..{end} s", "windows in order that do not overlap"
+                f"fit window {index}",
+                f"{start}..{end} s does not follow the window before it",
+                "windows must be in order and must not overlap",
             )
         last = end
         within = (binned.edges_s[:-1] >= start - slack) & (binned.edges_s[1:] <= end + slack)
@@ -138,10 +140,12 @@ def noise_chain(
     keep = window >= 0 if omit is None else (window >= 0) & (binned.phase != omit)
     bins = np.flatnonzero(keep)
     if not len(bins):
-        raise InputError("fit windows", "no bin of the recording inside them", "at least one bin")
+        raise InputError(
+            "fit windows", "they contain no bin of the recording", "they must contain at least one"
+        )
     variance = binned.variance_n2[bins]
     if np.any(variance < 0):
-        raise InputError("binned force", "a negative variance", "variances of at least 0")
+        raise InputError("binned force", "one of its variances is negative", "all must be at least 0")
     starts = np.concatenate([[True], (np.diff(window[bins]) != 0) | (np.diff(recording[bins]) != 0)])
     # In a Markov chain, the correlation across omitted bins is the product of the neighbours' correlations.
     neighbour = np.clip(np.nan_to_num(binned.correlation), -0.999, 0.999)

@@ -120,7 +120,9 @@ def find_map(
     """
     if starts < 1 or evaluations < 4:
         raise InputError(
-            "map", f"{starts} starts, {evaluations} evaluations", "at least 1 start and 4 evaluations"
+            "map",
+            f"{starts} starts and {evaluations} evaluations are too few",
+            "use at least 1 start and 4 evaluations",
         )
     space = SearchSpace(log_posterior)
     seeds = np.random.SeedSequence(seed).generate_state(starts)

@@ -31,7 +31,7 @@ class PolishSettings:
     largest, smallest : half-width of the trust region at the start, which is its largest, and the half-width
         below which the polish ends
     shrinks, grows : factors on the half-width after a run that is no better, and after a better one
-    enough : gain [nats] below which the polish ends, because it is far less than distinguishes two points
+    enough : gain [nats] below which the polish ends, because so small a gain does not distinguish two points
     """
 
     largest: float = 1.0

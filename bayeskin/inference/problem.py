@@ -58,8 +58,8 @@ class LogPosterior:
         ours, theirs = self.binned.edges_s, self.surrogate.edges_s
         if len(ours) != len(theirs) or not np.allclose(ours, theirs, rtol=0, atol=1e-6):
             raise InputError(
-                "surrogate", f"{len(theirs) - 1} bins up to {theirs[-1]:g} s",
-                f"the recording's {len(ours) - 1} bins up to {ours[-1]:g} s",
+                "surrogate", f"it has {len(theirs) - 1} bins up to {theirs[-1]:g} s",
+                f"it needs those of the recording, {len(ours) - 1} bins up to {ours[-1]:g} s",
             )  # fmt: skip
         if self.material is not None:
             _check_inside(self.material, self.surrogate.space)
@@ -220,7 +220,9 @@ class LogPosterior:
         """
         missing = [name for name in self.names if name not in theta]
         if missing:
-            raise InputError("theta", f"no {', '.join(missing)}", f"all of {', '.join(self.names)}")
+            raise InputError(
+                "theta", f"it lacks {', '.join(missing)}", f"it needs all of {', '.join(self.names)}"
+            )
         return self.to_sampling([theta[name] for name in self.names])
 
     @cached_property
@@ -268,13 +270,15 @@ def _chunks(index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 def _check_inside(material: ParameterSpace, box: ParameterSpace) -> None:
     if material.names != box.names:
         raise InputError(
-            "priors", ", ".join(material.names), f"the surrogate's parameters: {', '.join(box.names)}"
+            "priors",
+            f"they are those of {', '.join(material.names)}",
+            f"the surrogate's parameters are {', '.join(box.names)}, and both must be the same",
         )
     for ours, theirs in zip(material.parameters, box.parameters, strict=True):
         if ours.lower < theirs.lower or ours.upper > theirs.upper or not ours.lower < ours.upper:
             raise InputError(
-                f"prior of {ours.name}", f"{ours.lower:g}..{ours.upper:g} {ours.unit}",
-                f"bounds inside those of the surrogate, {theirs.lower:g}..{theirs.upper:g}",
+                f"prior of {ours.name}", f"it reaches from {ours.lower:g} to {ours.upper:g} {ours.unit}",
+                f"it must lie inside the surrogate's bounds, {theirs.lower:g} to {theirs.upper:g}",
             )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ class ShearSettings:
     """Settings of the fit of a shear.
 
     points : number of points of the prior from which the amplitude is learnt
-    least_share : mean share of the amplitude from which on a parameter belongs to the group
+    least_share : smallest mean share of the amplitude of a parameter that belongs to the group
     degree : degree of the polynomial
     newton : number of Newton steps onto the ridge
     step : step of central differences in a logarithm

@@ -31,7 +31,7 @@ class ResidualSettings:
 
     lags : number of bins over which the correlation is tested
     family_wise : probability that noise as assumed fails any of the tests
-    fewest : number of pairs of neighbouring bins from which on a kind of phase is tested by itself
+    fewest : smallest number of pairs of neighbouring bins with which a kind of phase is tested by itself
     smallest : smallest tail probability, whose score is still a finite number: 37 sd
     """
 

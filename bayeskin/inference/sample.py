@@ -135,15 +135,15 @@ def _check_settings(settings: SampleSettings, dim: int) -> None:
     if settings.walkers < 2 * dim + 2:
         raise InputError(
             "sample.walkers",
-            settings.walkers,
-            f"at least {2 * dim + 2}, which is twice the {dim} parameters plus 2",
+            f"{settings.walkers} walkers are too few",
+            f"use at least {2 * dim + 2}, which is twice the {dim} parameters plus 2",
         )
     if settings.ensembles < 1:
-        raise InputError("sample.ensembles", settings.ensembles, "at least 1")
+        raise InputError("sample.ensembles", f"it is {settings.ensembles}", "it must be at least 1")
     if settings.max_steps < SCHEDULE.first_check:
         raise InputError(
-            "sample.max_steps", settings.max_steps,
-            f"at least {SCHEDULE.first_check}, because the first steps do not yet follow the posterior",
+            "sample.max_steps", f"{settings.max_steps} steps are too few",
+            f"use at least {SCHEDULE.first_check}, because the first steps do not yet follow the posterior",
         )  # fmt: skip
 
 

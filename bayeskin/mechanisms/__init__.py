@@ -47,15 +47,18 @@ def catalogue() -> dict[str, Mechanism]:
 def _catalogue_on(_: tuple[str, ...]) -> dict[str, Mechanism]:
     """Returns the catalogue with the packages that are installed on a search path."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
-    found = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
-    found += [_checked(_loaded(entry)) for entry in entry_points(group=ENTRY_POINTS)]
-    _check_names(found)
-    known = {m.name: m for m in sorted(found, key=lambda m: m.name)}
-    for mechanism in found:
+    mechanisms = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
+    mechanisms += [_checked(_loaded(entry)) for entry in entry_points(group=ENTRY_POINTS)]
+    _check_names(mechanisms)
+    known = {m.name: m for m in sorted(mechanisms, key=lambda m: m.name)}
+    for mechanism in mechanisms:
         for name in mechanism.needs:
             if name not in known or known[name].needs:
-                expected = "a mechanism of the catalogue that needs none itself"
-                raise InputError(mechanism.name, f"a need of {name}", expected)
+                raise InputError(
+                    mechanism.name,
+                    f"it needs {name}",
+                    "it can need only mechanisms of the catalogue that need none themselves",
+                )
     return _with_both_look_alikes(known)
 
 
@@ -65,11 +68,12 @@ def _loaded(entry: EntryPoint) -> Mechanism:
     try:
         mechanism = entry.load()
     except Exception as error:  # the file of another package can raise any exception
-        whole = f'python -c "import {entry.module}" may show more'
-        expected = f"a mechanism in a file that Python can import; {whole}"
-        raise InputError(where, f"{type(error).__name__}: {error}", expected) from None
+        remedy = f'correct its file (python -c "import {entry.module}" may show more)'
+        raise InputError(where, f"it cannot be imported ({type(error).__name__}: {error})", remedy) from None
     if not isinstance(mechanism, Mechanism):
-        raise InputError(where, f"an object of the type {type(mechanism).__name__}", "a Mechanism")
+        raise InputError(
+            where, f"it is an object of the type {type(mechanism).__name__}", "it must be a Mechanism"
+        )
     return mechanism
 
 
@@ -81,11 +85,15 @@ def _checked(mechanism: Mechanism) -> Mechanism:
     where, names = f"mechanism {mechanism.name}", [p.name for p in mechanism.parameters]
     for p in mechanism.parameters:
         if not p.lower < p.upper or (p.in_log and not p.lower + p.offset > 0.0):
-            expected = "a lower bound below the upper one; for a logarithmic prior above 0, or with an offset"
-            raise InputError(f"{where}: {p.name}", f"{p.prior} from {p.lower:g} to {p.upper:g}", expected)
+            remedy = "the lower bound must be below the upper, and above 0 where the prior is logarithmic"
+            raise InputError(
+                f"{where}: {p.name}", f"its prior is {p.prior} from {p.lower:g} to {p.upper:g}", remedy
+            )
     if not mechanism.neutral or not set(names).issuperset(mechanism.neutral):
-        found = f"a neutral value of {', '.join(mechanism.neutral) or 'no parameter'}"
-        raise InputError(where, found, f"of at least one of its parameters {', '.join(names)}, and no other")
+        problem = f"`neutral` names {', '.join(mechanism.neutral) or 'no parameter'}"
+        raise InputError(
+            where, problem, f"it must name at least one of its parameters {', '.join(names)}, and no other"
+        )
     medians = ParameterSpace(mechanism.parameters).from_unit(np.full(len(names), 0.5)).tolist()
     return replace(mechanism, neutral={**dict(zip(names, medians, strict=True)), **mechanism.neutral})
 
@@ -98,11 +106,11 @@ def _check_names(mechanisms: Sequence[Mechanism]) -> None:
             owners[parameter.name].append(mechanism.name)
     for name, count in Counter(m.name for m in mechanisms).items():
         if count > 1:
-            raise InputError("mechanisms", f"{name} twice", "another name for one of them")
+            raise InputError("mechanisms", f"two of them have the name {name}", "rename one of them")
     for name, both in owners.items():
         if len(both) > 1:
             at = " and ".join(both)
-            raise InputError("mechanisms", f"a parameter {name} in {at}", "another name in one of them")
+            raise InputError("mechanisms", f"{at} have a parameter {name} each", "rename one of them")
 
 
 def _with_both_look_alikes(known: Mapping[str, Mechanism]) -> dict[str, Mechanism]:

@@ -22,7 +22,7 @@ Values = Mapping[str, Array]  # (n,) of each parameter of all active mechanisms,
 ForceOfTime = Callable[[Array], Array]  # maps times (t,) or (n, t) [s] to forces (n, t) [N]
 Observe = Callable[[Values, PadMotion, ForceOfTime], ForceOfTime]
 Refuted = Callable[[Values, PadMotion, Jumps], NDArray[np.bool_]]
-GAUSS_POINTS = 4  # in each interval between neighbouring bin edges, corners and repeats
+GAUSS_POINTS = 4  # number in each interval between neighbouring bin edges, corners and repeats
 SETTLING = np.array([3.0, 12.0])  # bins are divided at these multiples of the time constant after a corner
 
 

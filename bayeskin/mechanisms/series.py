@@ -23,7 +23,7 @@ from bayeskin.types import PadMotion
 
 STEPS_A_PHASE = 100
 GRID = 33  # number of displacements at which G is tabulated
-ITERATIONS = 8  # of force and lost displacement; the latter changes the force by some tenths at most
+ITERATIONS = 8  # iterations of force and lost displacement, which changes the force by some tenths at most
 
 
 def lost_in_series(

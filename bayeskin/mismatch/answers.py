@@ -92,7 +92,7 @@ def _fit_answer(context: DiagnosisContext, task: FitTask) -> dict[str, Any]:
     correction_n = _as_array(task.correction_n)
     posterior = partial(context.posterior, correction_n=correction_n, until_s=task.until_s)
     settings = TrustSettings(runs=task.runs)
-    result = fit_set(task.names, start, context.run, posterior, settings, correction_n)
+    result = fit_set(task.names, start, context.run, posterior, settings, correction_n, task.first)
     return {"message": result} if isinstance(result, str) else as_json(result)
 
 

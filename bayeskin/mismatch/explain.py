@@ -31,7 +31,7 @@ class Explanation:
     split_s : end of the recording's beginning [s], or None where no third hold follows
     beginning : fits to the beginning, or None where they failed
     emulated : posterior of the best set
-    agreement : of each of several recordings with the others; empty for a single recording
+    agreement : how each of several recordings agrees with the others; empty for a single recording
     """
 
     search: SearchResult

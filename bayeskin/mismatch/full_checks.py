@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayeskin.mismatch.search_context import SearchContext, gained, noise_of, title
+from bayeskin.mismatch.search_context import SearchContext, fit_again, gained, noise_of, title
 from bayeskin.mismatch.search_record import Check, Names
 from bayeskin.mismatch.tasks import FitTask, FullRunTask
 from bayeskin.mismatch.trust_region import SetFit
@@ -78,8 +78,8 @@ def forward_error(fit: SetFit, full_n: object) -> Array:
 def _unchecked(context: SearchContext) -> list[SetFit]:
     """Returns the fits to check.
 
-    These are the likely sets, subsets of the likeliest set that have the same mechanisms of the tissue, and
-    the likeliest set itself if its run has changed since its check.
+    These are the likely sets, the likeliest set itself if its run has changed since its check, and subsets of
+    it that have the same mechanisms of the tissue and are not far behind.
     """
     record, settings = context.record, context.settings
     order = record.likeliest(len(record.fits))
@@ -89,6 +89,7 @@ def _unchecked(context: SearchContext) -> list[SetFit]:
     subsets = [
         fit for fit in order
         if set(fit.fit.names) < set(best.fit.names) and context.solved(fit.fit.names) == solved
+        and gained(best, fit) <= settings.behind
     ]  # fmt: skip
     unchecked = {
         fit.fit.names: fit for fit in (*likely, *subsets)
@@ -118,7 +119,7 @@ def _record_checks(
         off = context.rms(error_n - fit.correction_n)
         context.record.checks[names] = Check(first.run.theta, np.asarray(full_n), off)
         if off > context.settings.exact * noise_of(context.binned):
-            tasks.append(FitTask(names, fit.fit.theta, context.settings.runs, tuple(error_n.tolist())))
+            tasks.append(fit_again(fit, context.settings.runs, error_n))
             difference = f"the full model differs by {1e3 * off:.1f} mN RMS"
             context.tell(f"{title(names)}: {difference}; the set is fitted again with this correction")
     return tasks

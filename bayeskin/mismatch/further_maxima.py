@@ -15,7 +15,14 @@ import numpy as np
 from bayeskin.mismatch.candidates import shapes_of
 from bayeskin.mismatch.full_checks import forward_error
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.search_context import SearchContext, correction, gained, noise_of, title
+from bayeskin.mismatch.search_context import (
+    SearchContext,
+    correction,
+    fit_again,
+    gained,
+    noise_of,
+    title,
+)
 from bayeskin.mismatch.search_record import Check, Names
 from bayeskin.mismatch.tasks import FitTask, FullRunTask
 from bayeskin.mismatch.tissue_starts import nearest_tissues
@@ -58,9 +65,7 @@ def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], Non
         check = Check(fit.run.theta, np.asarray(full_n), context.rms(error_n - fit.correction_n))
         corrected: object = fit
         if check.off > settings.exact * noise_of(context.binned):
-            (corrected,) = context.ask(
-                [FitTask(names, fit.fit.theta, settings.runs, tuple(error_n.tolist()))]
-            )
+            (corrected,) = context.ask([fit_again(fit, settings.runs, error_n)])
         for maximum in _distinct(context, [corrected], maxima, settings.close):
             context.tell(f"another maximum of {title(names)}: {gained(maximum, best):+.1f} nats")
             maxima.append(maximum)
@@ -95,9 +100,7 @@ def _fits_elsewhere(context: SearchContext, best: SetFit) -> list[SetFit]:
     ]
     first = _distinct(context, context.ask(climbs), [best], settings.behind)
     remaining = settings.runs - settings.first
-    continued = context.ask(
-        [FitTask(names, fit.fit.theta, remaining, correction_n) for fit in first if not fit.settled]
-    )
+    continued = context.ask([fit_again(fit, remaining, fit.correction_n) for fit in first if not fit.settled])
     ended = [*(fit for fit in first if fit.settled), *continued]
     return _distinct(context, ended, [best], settings.close)[: settings.maxima]
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.search_context import correction
-from bayeskin.mismatch.tasks import AnswerTasks, FitTask
+from bayeskin.mismatch.search_context import fit_again
+from bayeskin.mismatch.tasks import AnswerTasks
 from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.types import BinnedForce
 
@@ -50,7 +50,7 @@ def fit_beginning(ask: AnswerTasks, sets: Sequence[SetFit], split_s: float | Non
     """
     if split_s is None:
         return None
-    answers = ask([FitTask(fit.fit.names, fit.fit.theta, RUNS, correction(fit), split_s) for fit in sets])
+    answers = ask([fit_again(fit, RUNS, fit.correction_n, split_s) for fit in sets])
     fits = [answer.fit for answer in answers if isinstance(answer, SetFit)]
     base = next((fit for fit in fits if not fit.names), None)
     return None if base is None else Beginning(base, max(fits, key=weight))

@@ -79,9 +79,9 @@ class Searcher:
                                for tissue in self._tissues[: settings.starts]])  # fmt: skip
         context.keep(answers)
         if not context.record.fits:
-            why = next((f": {answer}" for answer in answers if isinstance(answer, str)), "")
-            expected = "tissues for which the model runs, with an E_s of at most twice E_c"
-            raise InputError("priors", f"no tissue for which the model runs{why}", expected)
+            why = next((f" ({answer})" for answer in answers if isinstance(answer, str)), "")
+            remedy = "they must allow tissues for which the model runs, with an E_s of at most twice E_c"
+            raise InputError("priors", f"the model runs for no tissue that they allow{why}", remedy)
 
     def search_sets(self) -> None:
         """Adds, leaves out and exchanges mechanisms as long as this gains weight."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -85,7 +85,7 @@ class SearchContext:
         if since is not None and fits:
             behind = max(behind, (1.0 - settings.near) * gained(fits[0], since))
         for continued in self.ask([
-            FitTask(fit.fit.names, fit.fit.theta, settings.runs - settings.first, correction(fit))
+            fit_again(fit, settings.runs - settings.first, fit.correction_n)
             for i, fit in enumerate(fits)
             if not fit.settled and not self._is_recorded(fit)
             and (i < settings.best or gained(self.record.best, fit) <= behind)
@@ -110,7 +110,23 @@ def noise_of(binned: BinnedForce) -> float:
 
 def correction(fit: SetFit) -> tuple[float, ...]:
     """Returns the force [N] that a fit has added to its runs, in the form for tasks; empty for none."""
-    return tuple(fit.correction_n.tolist()) if fit.correction_n.any() else ()
+    return for_task(fit.correction_n)
+
+
+def for_task(correction_n: Array) -> tuple[float, ...]:
+    """Returns a correction (m,) [N] in the form for tasks; empty for none."""
+    return tuple(correction_n.tolist()) if correction_n.any() else ()
+
+
+def fit_again(fit: SetFit, runs: int, correction_n: Array, until_s: float | None = None) -> FitTask:
+    """Returns the task of a fit that starts where another fit of the set has ended, from its run.
+
+    runs : largest number of model runs, with the existing one
+    correction_n (m,) : force [N] that is added to every run
+    until_s : end of the part of the recording that is fitted [s]; None for the whole recording
+    """
+    run = replace(fit.run, force_n=fit.run.force_n - fit.correction_n)
+    return FitTask(fit.fit.names, fit.fit.theta, runs, for_task(correction_n), until_s, first=run)
 
 
 def title(names: Sequence[str]) -> str:

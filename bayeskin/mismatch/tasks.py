@@ -34,6 +34,7 @@ class FitTask:
     until_s : end of the part of the recording that is fitted [s]; None for the whole recording
     recording : number of the recording that is fitted alone, with its values by their plain names; None for
         all recordings together
+    first : run of the set at `start` that exists already, without a correction; None where there is none
     """
 
     names: tuple[str, ...]
@@ -42,6 +43,7 @@ class FitTask:
     correction_n: tuple[float, ...] = ()
     until_s: float | None = None
     recording: int | None = None
+    first: ModelRun | None = None
 
 
 @dataclass(frozen=True)

@@ -97,23 +97,22 @@ def as_json(set_fit: SetFit) -> dict[str, Any]:
 def fit_set(
     names: Sequence[str], start: Mapping[str, float], skin: Skin, local: Local,
     settings: TrustSettings = TrustSettings(), correction_n: Array | None = None,
+    first: ModelRun | None = None,
 ) -> SetFit | str:  # fmt: skip
     """Returns the fit of a set that is reached from `start`; if the first run fails, its message.
 
     start : values of all parameters by name, SI
     skin : runs the forward model; local : returns the posterior near runs
     correction_n (m,) : force [N] that is added to each run
+    first : the run at `start`, without the correction, where it exists already
     """
 
-    def run_at(theta: Mapping[str, float]) -> ModelRun | str:
-        run = skin(names, theta)
-        return (
-            run
-            if isinstance(run, str) or correction_n is None
-            else replace(run, force_n=run.force_n + correction_n)
-        )
+    def corrected(run: ModelRun | str) -> ModelRun | str:
+        if isinstance(run, str) or correction_n is None:
+            return run
+        return replace(run, force_n=run.force_n + correction_n)
 
-    run = run_at(start)
+    run = corrected(skin(names, start) if first is None else first)
     if isinstance(run, str):
         return run
     runs, posterior = [run], local(names, [run])
@@ -133,7 +132,7 @@ def fit_set(
             settled = True
             break
         run_count += 1
-        new_run = run_at(posterior.named(posterior.from_sampling(proposal)))
+        new_run = corrected(skin(names, posterior.named(posterior.from_sampling(proposal))))
         gain = -np.inf
         if not isinstance(new_run, str):
             runs.append(new_run)

@@ -113,8 +113,9 @@ def _nearest_draw(
             break
     if nearest is None:
         low_n, high_n = CASES.peak_n
-        found_n = f"no draw of {', '.join(plan.mechanisms)} with a peak of {low_n:g} to {high_n:g} N"
-        raise InputError("proof", found_n, f"at least one such draw among {CASES.batches * CASES.batch}")
+        tried = f"{CASES.batches * CASES.batch} draws of {', '.join(plan.mechanisms)}"
+        problem = f"none of {tried} has a peak of {low_n:g} to {high_n:g} N"
+        raise InputError("proof", problem, "use another seed")
     return Case(plan, screen.by_name(nearest[0]), nearest[1], 0.0, floor_n, target)
 
 

@@ -57,7 +57,7 @@ class Concealed:
     key: Mapping[str, Any]
 
 
-Made = Concealed | tuple[str, str, str]  # or the texts of an InputError: where, found, expected
+Outcome = Concealed | tuple[str, str, str]  # or the texts of an InputError: where, problem, remedy
 
 
 @lru_cache(maxsize=3)
@@ -83,7 +83,7 @@ def full_run(case: Case, names: Sequence[str], change: Change) -> Simulation:
     return simulate_on(problem, solid, TOLERANCE, change.moved(MOTION), {**case.theta, **values}, binds)
 
 
-def made_of(plan: Plan) -> Made:
+def concealed_or_error(plan: Plan) -> Outcome:
     """Returns `concealed` by the full model and the shipped surrogates, or the texts of an InputError.
 
     A worker process calls this function.
@@ -91,7 +91,7 @@ def made_of(plan: Plan) -> Made:
     try:
         return concealed(plan, shipped_screen(), full_run)
     except InputError as error:
-        return error.where, error.found, error.expected
+        return error.where, error.problem, error.remedy
 
 
 def conceal(
@@ -100,7 +100,7 @@ def conceal(
     count: int,
     only: Sequence[str] = (),
     tell: Callable[[float, str], None] = lambda share, note: None,
-    make: Callable[[Plan], Made] = made_of,
+    make: Callable[[Plan], Outcome] = concealed_or_error,
     run_all: Map = TWO_AT_ONCE,
 ) -> int:
     """Makes the missing recordings of a set of `count`, and returns how many it made.
@@ -119,7 +119,7 @@ def conceal(
     with closing(run_all(make, [wanted[place] for place in missing])) as results:
         for index, result in results:
             if isinstance(result, Lost):
-                raise InputError("proof", result.reason, "a worker process that finishes its work")
+                raise InputError("proof", result.reason, "run the same command again")
             if not isinstance(result, Concealed):
                 raise InputError(*result)
             _write(folder, numbers[missing[index]], result)
@@ -141,7 +141,7 @@ def concealed(plan: Plan, screen: Screen, run: Run = full_run) -> Concealed:
         if runs.ok:
             return _recording_and_key(case, runs, screen, attempt)
     raise InputError(
-        f"proof: {plan.label}", f"{ATTEMPTS} runs of the full model that failed", "one that succeeds"
+        f"proof: {plan.label}", f"the full model failed in {ATTEMPTS} attempts", "use another seed"
     )
 
 
@@ -248,12 +248,16 @@ def _start_or_check(folder: Path, seed: int, count: int, only: Sequence[str]) ->
     settings: dict[str, Any] = {"seed": seed, "count": count, **({"only": list(only)} if only else {})}
     if not path.is_file():
         if (folder / seals.INDEX).is_file() and seals.read_index(folder):
-            raise InputError(folder, "a set without its seals", "another folder for a new set")
+            raise InputError(
+                folder, "it contains a set without its seals", "use another folder for a new set"
+            )
         seals.write_json(folder / seals.INDEX, {"recordings": {}})
         seals.write_json(path, settings)
     elif (stored := seals.read_json(path)) != settings:
         raise InputError(
-            folder, f"a set with the settings {stored}", f"the settings {settings}, or another folder"
+            folder,
+            f"it contains a set with the settings {stored}",
+            f"use another folder for the settings {settings}",
         )
 
 

@@ -17,7 +17,7 @@ WHITE = {"rest": 1.0, "hold": 1.8, "load": 8.0, "unload": 6.0}  # sd at 20 Hz, r
 SLOW = {"rest": 0.1, "hold": 1.9, "load": 0.3, "unload": 0.3}
 SLOW_S = 0.55
 SPIKES_PER_S = {"rest": 0.02, "hold": 0.25, "load": 0.1, "unload": 0.01}
-SPIKE_LEAST, SPIKE_MORE = 6.0, 8.0  # in multiples of the floor: the least height, and the mean excess over it
+SPIKE_LEAST, SPIKE_MORE = 6.0, 8.0  # least height, and mean excess over it, in noise floors
 FLOORS_N = (1.5e-3, 2.5e-3)  # bounds between which a recording's floor is drawn
 
 

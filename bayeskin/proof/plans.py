@@ -84,7 +84,9 @@ def _plans_in_turn(known: Mapping[str, Mechanism], only: Sequence[str], count: i
     """
     for name in only:
         if name not in ("nothing", *known, *OUTSIDE):
-            raise InputError("--only", name, f"nothing, or one of {', '.join((*known, *OUTSIDE))}")
+            raise InputError(
+                "--only", f"{name} is not known", f"use one of {', '.join(('nothing', *known, *OUTSIDE))}"
+            )
     times = [len(range(place, count, len(only))) for place in range(len(only))]
     targets = [np.exp(np.interp((np.arange(n) + 0.5) / n, (0.0, 1.0), np.log(SIZES))) for n in times]
     return [

@@ -18,9 +18,10 @@ from typing import Any
 
 from bayeskin import storage
 from bayeskin.access_guard import guarded
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 
 RECORDINGS, SEALS, VERDICTS = "recordings", "seals", "verdicts"
+NEEDED = "bayeskin needs a file of a proof's set"
 INDEX, SCORINGS, SET = "index.json", "scorings.json", "set.json"
 
 
@@ -39,9 +40,9 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text())
     except OSError as error:
-        raise InputError(path, error.strerror or "an unreadable file", "a file of a proof's set") from None
+        raise InputError(path, f"it cannot be read ({reason_of(error)})", NEEDED) from None
     except ValueError:
-        raise InputError(path, "a file that is not JSON", "a file of a proof's set") from None
+        raise InputError(path, "it is not JSON", NEEDED) from None
 
 
 def read_index(folder: Path) -> dict[str, dict[str, str]]:
@@ -54,7 +55,11 @@ def read_index(folder: Path) -> dict[str, dict[str, str]]:
     if not isinstance(hashes, dict) or not all(
         isinstance(pair, dict) and set(pair) == {"recording_sha256", "key_sha256"} for pair in hashes.values()
     ):
-        raise InputError(folder / INDEX, "no index of a set", "the hashes of recordings and keys, by number")
+        raise InputError(
+            folder / INDEX,
+            "it is not the index of a set",
+            "bayeskin needs the hashes of recordings and keys, by number",
+        )
     return dict(sorted(hashes.items()))
 
 
@@ -71,7 +76,11 @@ def read_keys(folder: Path) -> dict[str, Mapping[str, Any]]:
             (folder / SEALS / f"{number}.json", hashes["key_sha256"]),
         ):
             if sha256(path) != expected:
-                raise InputError(path, "other contents than the index says", f"sha256 {expected[:12]}...")
+                raise InputError(
+                    path,
+                    "its contents differ from those of the index",
+                    f"its sha256 must be {expected[:12]}...",
+                )
         keys[number] = read_json(folder / SEALS / f"{number}.json")
     return keys
 

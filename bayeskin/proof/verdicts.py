@@ -49,7 +49,9 @@ def read_verdict(folder: Path, number: str, recording_sha256: str) -> Verdict | 
     if stored is None:
         return None
     if not isinstance(stored, dict) or not {"recording_sha256", "sources_sha256", "answer"} <= set(stored):
-        raise InputError(path, "no verdict of a proof", "a verdict that `bayeskin prove` wrote")
+        raise InputError(
+            path, "it is not a verdict of a proof", "bayeskin needs a verdict that `bayeskin prove` wrote"
+        )
     if stored["recording_sha256"] != recording_sha256:
         return None
     return Verdict(recording_sha256, stored.get("version", ""), stored["sources_sha256"], stored["answer"])

@@ -38,8 +38,8 @@ def uniform_edges(recording_or_end_s: Recording | float, width_s: float = BIN_WI
     source = recording_or_end_s
     end_s = float(source.time_s[-1]) if isinstance(source, Recording) else float(source)
     if not end_s < MOST_BINS * width_s:
-        problem = f"{width_s:g} s for a recording of {end_s:g} s"
-        raise InputError("bin_width_s", problem, f"a width that gives fewer than {MOST_BINS} bins")
+        problem = f"{width_s:g} s is too short for a recording of {end_s:g} s"
+        raise InputError("bin_width_s", problem, f"use a width that gives fewer than {MOST_BINS} bins")
     return width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float)
 
 
@@ -86,17 +86,20 @@ def _refuse_edges(recording: Recording, edges_s: Array) -> None:
     time_s = recording.time_s
     where = f"{recording.name}: bin edges"
     if edges_s.ndim != 1 or len(edges_s) < 2 or not np.all(np.diff(edges_s) > 0):
-        raise InputError(where, "edges that do not increase", "at least two increasing times")
+        raise InputError(where, "the edges do not increase", "at least two increasing times are needed")
     slack = 1e-6 * (edges_s[1] - edges_s[0])
     last_s = time_s[-1] + _interval_s(recording)
     if edges_s[0] < time_s[0] - slack or edges_s[-1] > last_s + slack:
-        problem = f"{edges_s[0]:g} to {edges_s[-1]:g} s"
-        raise InputError(where, problem, f"times within {time_s[0]:g} to {last_s:g} s")
+        problem = f"the edges reach from {edges_s[0]:g} to {edges_s[-1]:g} s"
+        raise InputError(where, problem, f"they must lie within {time_s[0]:g} to {last_s:g} s")
     counts = np.diff(np.searchsorted(time_s, edges_s - slack))
     if counts.min() < 2:
         fewest = int(np.argmin(counts))
-        problem = f"{counts[fewest]} samples in {edges_s[fewest]:g}-{edges_s[fewest + 1]:g} s"
-        raise InputError(where, problem, "at least 2 in a bin, whose width is fit.bin_width_s")
+        bin_s = f"the bin from {edges_s[fewest]:g} to {edges_s[fewest + 1]:g} s"
+        problem = f"the number of samples in {bin_s} is {counts[fewest]}"
+        raise InputError(
+            where, problem, "each bin needs at least 2, and fit.bin_width_s is the width of a bin"
+        )
 
 
 def _bin_means(time_s: Array, values: Array, edges_s: Array) -> Array:

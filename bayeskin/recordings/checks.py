@@ -37,15 +37,17 @@ def refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Ar
     """
     named = {"time": time_s, "displacement": displacement_m, "force": force_n}
     if len(time_s) < PLAUSIBLE.samples:
-        raise InputError(where, f"{len(time_s)} samples", f"at least {PLAUSIBLE.samples}")
+        raise InputError(
+            where, f"the number of samples is {len(time_s)}", f"it must be at least {PLAUSIBLE.samples}"
+        )
     for name, values in named.items():
         refuse_infinite(f"{where}, row", first_row, name, values)
     back = np.flatnonzero(np.diff(time_s) <= 0)
     if len(back):
         before, after = time_s[back[0]], time_s[back[0] + 1]
-        problem = f"time {after:.6g} s after {before:.6g} s"
+        problem = f"the time is {after:.6g} s after {before:.6g} s"
         raise InputError(
-            f"{where}, row {first_row + back[0] + 1}", problem, "times that increase from row to row"
+            f"{where}, row {first_row + back[0] + 1}", problem, "times must increase from row to row"
         )
     for name, values, largest, unit in (
         ("displacement", displacement_m - displacement_m[0], PLAUSIBLE.largest_m, "m"),
@@ -54,14 +56,16 @@ def refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Ar
         peak = int(np.argmax(np.abs(values)))
         value = abs(values[peak])
         if value > largest:
-            problem = f"a {name} of {value:.4g} {unit}"
+            problem = f"the {name} is {value:.4g} {unit}"
             smaller = "mm" if unit == "m" else "mN"
-            expected = f"at most {largest:g} {unit} (is the column in {smaller}?)"
-            raise InputError(f"{where}, row {first_row + peak}", problem, expected)
+            remedy = f"it must be at most {largest:g} {unit} (is the column in {smaller}?)"
+            raise InputError(f"{where}, row {first_row + peak}", problem, remedy)
     travel = float(np.ptp(displacement_m))
     if travel < PLAUSIBLE.least_travel_m:
-        problem = f"a displacement that changes by {travel:.3g} m in all"
-        raise InputError(where, problem, f"at least {PLAUSIBLE.least_travel_m:g} m (is its unit right?)")
+        problem = f"the displacement changes by {travel:.3g} m in all"
+        raise InputError(
+            where, problem, f"it must change by at least {PLAUSIBLE.least_travel_m:g} m (is its unit right?)"
+        )
 
 
 def refuse_infinite(where: str, first_row: int, what: str, values: Array) -> None:
@@ -69,7 +73,9 @@ def refuse_infinite(where: str, first_row: int, what: str, values: Array) -> Non
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise InputError(
-            f"{where} {first_row + bad[0]}, column {what!r}", f"{values[bad[0]]}", "a finite number"
+            f"{where} {first_row + bad[0]}, column {what!r}",
+            f"the value is {values[bad[0]]}",
+            "it must be a finite number",
         )
 
 

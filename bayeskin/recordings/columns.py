@@ -66,16 +66,18 @@ def stated_unit(quantity: str, text: str) -> StatedUnit:
     sign, name = (text[0], text[1:]) if text[:1] in ("+", "-") else ("", text)
     unit = unit_of(name, quantity)
     if unit is None:
-        expected = (
-            f"one of {', '.join(UNITS[quantity])}; a minus before the unit turns the sign of the values"
+        remedy = (
+            f"use one of {', '.join(UNITS[quantity])}; a minus before the unit turns the sign of the values"
         )
-        raise InputError(f"--unit {quantity}={text}", f"the unit {name!r}", expected)
+        raise InputError(f"--unit {quantity}={text}", f"the unit {name!r} is not known", remedy)
     return StatedUnit(text, UNITS[quantity][unit] * (-1.0 if sign == "-" else 1.0), sign != "")
 
 
 def _refuse_other_quantity(quantity: str) -> None:
     if quantity not in QUANTITIES:
-        raise InputError("columns and units", repr(quantity), f"one of {', '.join(QUANTITIES)}")
+        raise InputError(
+            "columns and units", f"{quantity!r} is not known", f"use one of {', '.join(QUANTITIES)}"
+        )
 
 
 def candidates_of(where: str, heading: Heading, stated: Stated) -> list[Candidates]:
@@ -120,9 +122,12 @@ def _stated_column(place: str, quantity: str, wanted: str, heading: Heading) -> 
     else:
         matching = [i for i, name in enumerate(heading.names) if plain(name) == plain(wanted)]
     if len(matching) != 1:
-        found = f"columns {_listed(heading)}" if heading.fault == "" else heading.fault
-        expected = f"a column {wanted!r}, or a number from 1 to {len(heading.names)}"
-        raise InputError(f"{place}: --{quantity} {wanted}", found, expected)
+        problem = heading.fault or f"the columns are {_listed(heading)}"
+        raise InputError(
+            f"{place}: --{quantity} {wanted}",
+            problem,
+            f"name one of these columns, or give a number from 1 to {len(heading.names)}",
+        )
     index = matching[0]
     name = heading.names[index]
     return Column(index, quantity, name.strip(), unit_in(name, quantity, heading.units[index]))
@@ -135,13 +140,13 @@ def _listed(heading: Heading) -> str:
 def _missing(place: str, quantity: str, heading: Heading, near: Sequence[Column]) -> InputError:
     """Returns the error of a quantity without a column; `near` are columns that name it and do not fit."""
     if heading.fault:
-        expected = "a header; or import with --time 1 --displacement 2 --force 3 (the columns) and --unit"
-        return InputError(place, heading.fault, expected)
-    said = [f"column {c.label}, {c.aside or f'whose unit is {c.unit!r}'}" for c in near]
-    found = " and ".join(said) or f"columns {_listed(heading)}"
+        remedy = "write a header, or import with --time 1 --displacement 2 --force 3 (the columns) and --unit"
+        return InputError(place, heading.fault, remedy)
+    said = [f"column {c.label} is {c.aside or f'in the unit {c.unit!r}'}" for c in near]
+    problem = " and ".join(said) or f"there is no {quantity} column among {_listed(heading)}"
     units = ", ".join(UNITS[quantity])
-    expected = f"a {quantity} column with one of the units {units}; or import with --{quantity} COLUMN"
-    return InputError(place, found, expected)
+    remedy = f"a {quantity} column in one of {units} is needed; or import with --{quantity} COLUMN"
+    return InputError(place, problem, remedy)
 
 
 def _refuse_missing_units(place: str, columns: Candidates, stated: Stated) -> None:
@@ -151,10 +156,10 @@ def _refuse_missing_units(place: str, columns: Candidates, stated: Stated) -> No
         return
     quantities = dict.fromkeys(c.quantity for c in missing)
     listed = ", ".join(f"{c.label} ({c.unit!r})" if c.unit else c.label for c in missing)
-    found = f"column{'s' * (len(missing) > 1)} {listed} without a known unit"
+    problem = f"the unit of {listed} is not known"
     options = " ".join(f"--unit {q}=UNIT" for q in quantities)
     units = "; ".join(f"{q}: {', '.join(UNITS[q])}" for q in quantities)
-    raise InputError(place, found, f"a unit; or import with {options} ({units})")
+    raise InputError(place, problem, f"write it, or import with {options} ({units})")
 
 
 def _side_by_side(columns: Candidates) -> list[Candidates] | None:

@@ -12,7 +12,7 @@ from bayeskin.recordings.units import QUANTITIES, UNITS, is_unit, plain, unit_of
 from bayeskin.recordings.vocabulary import ASIDE, JAPANESE, SYMBOLS, WORDS
 
 _BRACKETS = re.compile(r"[\[({<]([^\[\](){}<>]*)[\])}>]")
-_COMMENT = re.compile(r"^\s*(?:#+|%+|//+|!+)\s*")  # as numpy and others begin a header
+_COMMENT = re.compile(r"^\s*(?:#+|%+|//+|!+)\s*")  # numpy and other programs begin a header like this
 _RULE = re.compile(r"[-=_+|*.\s]*")
 
 

@@ -15,7 +15,7 @@ from bayeskin.types import Array, BinnedForce, Jumps, PadMotion, Recording, Span
 from bayeskin.types.joint import end_to_end
 
 PAUSE_S = 20.0  # between the end of a recording and the start of the next one on the common axis
-RETURN_S = 1.0  # in which the drawn pads return to their first place at the start of a pause
+RETURN_S = 1.0  # time in which the drawn pads return to their first place at the start of a pause
 
 
 def spans_of(recordings: Sequence[Recording], motions: Sequence[PadMotion]) -> tuple[Span, ...]:

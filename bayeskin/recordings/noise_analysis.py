@@ -101,8 +101,9 @@ def analyse(recording: Recording, phases: Sequence[Phase], window_s: float = NOI
     15 of a slow recording) to distinguish noise from force.
     """
     if np.ptp(recording.force_n) == 0.0:
-        problem = f"{recording.force_n[0]:g} N throughout"
-        raise InputError(f"{recording.name}: force", problem, "a force that changes")
+        raise InputError(
+            f"{recording.name}: force", f"it is {recording.force_n[0]:g} N throughout", "it must change"
+        )
     time_s = recording.time_s
     bounds = np.searchsorted(time_s, [*(p.start_s for p in phases), np.inf])
     bounds[0] = 0
@@ -159,9 +160,9 @@ def _analyse_once(
     least = min(NOISE.least_window, max(NOISE.least_window_slow, round(NOISE.window_s / interval_s)))
     size = min(max(round(window_s / interval_s), least), int(NOISE.longest_share * longest))
     if size < least:
-        problem = f"{longest} samples in the longest phase"
+        problem = f"the number of samples in the longest phase is {longest}"
         fewest = round(least / NOISE.longest_share) + 1
-        raise InputError(recording.name, problem, f"at least {fewest}, to estimate its noise")
+        raise InputError(recording.name, problem, f"at least {fewest} are needed to estimate the noise")
     windows = [
         _phase_windows(time_s, despiked, breaks[(breaks >= a) & (breaks <= b)], size, interval_s)
         for a, b in pairwise(bounds)

@@ -46,12 +46,12 @@ def is_number(cell: Any) -> bool:
 
 
 def describe_cell(cell: Any) -> str:
-    """Returns what a message says of a cell that is no number."""
+    """Returns a clause about a cell that is not a number, for a message."""
     if cell is None or not str(cell).strip():
-        return "an empty cell, or a formula whose value is not stored in the file"
+        return "the cell is empty, or has a formula whose value is not stored in the file"
     if isinstance(cell, date | time | timedelta) or re.match(r"\s*\d+:\d\d", str(cell)):
-        return f"a date or a time of day, {str(cell).strip()[:40]!r}"
-    return repr(cell)[:60]
+        return f"the cell contains a date or a time of day, {str(cell).strip()[:40]!r}"
+    return f"the cell contains {cell!r}"[:80]
 
 
 class Numbers:
@@ -90,14 +90,14 @@ class Numbers:
         self.read = {decimal: [*self.read[decimal], values] for decimal, values in chunk.items()}
 
     def first_wrong(self, cells: Sequence[Any]) -> tuple[int, str]:
-        """Returns the index of the first wrong cell of a refused chunk, and what was expected there."""
+        """Returns the index of the first wrong cell of a refused chunk, and what it must be."""
         possible = set(self.read)
         for index, cell in enumerate(cells):
             before, possible = possible, {decimal for decimal in possible if _fits(cell, decimal)}
             if not possible:
                 other = is_number(cell) and any(_fits(cell, decimal) for decimal in DECIMALS)
                 sign = f" with the decimal sign {next(iter(before))!r}, as in the rows above" if other else ""
-                return index, f"a number{sign}"
+                return index, f"it must be a number{sign}"
         raise AssertionError("every cell is a number")
 
     def values(self, decimal: str) -> Array:

@@ -16,16 +16,14 @@ from bayeskin.recordings.columns import Stated
 from bayeskin.recordings.headers import Column
 from bayeskin.recordings.settle import settled
 from bayeskin.recordings.tables import Table, Unreadable, tables_of
-from bayeskin.recordings.text import Rows, rows_of_text
-from bayeskin.recordings.workbooks import rows_of_array, sheets_of_xls, sheets_of_xlsx
+from bayeskin.recordings.text import rows_of_text
+from bayeskin.recordings.workbooks import WORKBOOKS, rows_of_array, sheets_of_workbook
 from bayeskin.types import Recording
 
-ALL = "all"  # as the name of a sheet: every table of the file
-_WORKBOOKS = (".xlsx", ".xlsm", ".xls")
+ALL = "all"  # this name of a sheet stands for every table of the file
 _TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".tra", ".lvm", ".mach-1")
 _STORED = (".h5", ".hdf5")
-_ENDINGS = (*_WORKBOOKS, *_TEXTS, ".npy", *_STORED)
-_EARLY_EXCEL = (b"\x09\x00", b"\x09\x02", b"\x09\x04", b"\x09\x08")  # the first record of a workbook
+_ENDINGS = (*WORKBOOKS, *_TEXTS, ".npy", *_STORED)
 _NOTHING_STATED = Stated()
 
 
@@ -64,7 +62,7 @@ def read_recording(
     Raises
     ------
     InputError : the file cannot be read, is not a recording of a skin test, or can be understood in several
-        ways; the message says where the fault is, what was found and what was expected.
+        ways; the message says where the fault is, what it is, and what helps.
     """
     return read_tables(path, sheet=sheet, stated=stated)[0].recording
 
@@ -81,10 +79,14 @@ def read_tables(
     refuse_endless(path, "a recording")
     kind = path.suffix.lower()
     if kind not in _ENDINGS:
-        raise InputError(path, f"the ending {kind!r}", f"one of {', '.join(_ENDINGS)}")
+        raise InputError(path, f"the ending {kind!r} is not known", f"use one of {', '.join(_ENDINGS)}")
     if kind in _STORED:
         if sheet is not None or stated != _NOTHING_STATED:
-            raise InputError(path, "a file of bayeskin, where nothing is to be chosen", "no such option")
+            raise InputError(
+                path,
+                "a file of bayeskin has one table with known columns and units",
+                "leave out the options that state them",
+            )
         return (Reading(_read_stored(path)),)
     data = bytes_of(path, "a recording")
     tables, notes = _tables(path, kind, data, sheet, stated)
@@ -115,22 +117,13 @@ class _Labelled:
         return PLAUSIBLE.samples if isinstance(self.table, InputError) else self.table.rows
 
 
-def _sheets(path: Path, kind: str, data: bytes) -> Mapping[str, Rows] | None:
-    """Returns the rows of the sheets of a workbook, or None for a text. The content decides, not the name."""
-    if data.startswith(b"PK\x03\x04") or kind in (".xlsx", ".xlsm"):
-        return sheets_of_xlsx(path, data)
-    if data.startswith(b"\xd0\xcf\x11\xe0") or (kind == ".xls" and data[:2] in _EARLY_EXCEL):
-        return sheets_of_xls(path, data)
-    return None
-
-
 def _tables(
     path: Path, kind: str, data: bytes, sheet: str | None, stated: Stated
 ) -> tuple[list[_Labelled], tuple[str, ...]]:
     """Returns the tables of a file in their order, and notes. A sheet of the name `sheet` is read alone."""
     if kind == ".npy":
         return _labelled("", tables_of(str(path), rows_of_array(path, data), stated)), ()
-    sheets = _sheets(path, kind, data)
+    sheets = sheets_of_workbook(path, kind, data)
     if sheets is None:
         rows, delimiter, notes = rows_of_text(path, data)
         return _labelled("", tables_of(str(path), rows, stated, delimiter == " ")), notes
@@ -164,16 +157,22 @@ def _chosen(
     labels = [entry.label for entry in tables]
     wanted = [entry for entry in tables if sheet in (None, ALL) or sheet in entry.names]
     if not wanted and tables:
-        raise InputError(path, f"the tables {labels}", f"a sheet {sheet!r}")
+        raise InputError(
+            path, f"it has no sheet or table {sheet!r}", f"use one of {', '.join(map(repr, labels))}"
+        )
     long = [entry for entry in wanted if entry.rows >= PLAUSIBLE.samples] or wanted
     fitting = [entry for entry in long if not isinstance(entry.table, Unreadable)]
     if not fitting:
         unreadable = [entry.table for entry in long if isinstance(entry.table, Unreadable)]
         longest = max(unreadable, key=lambda table: table.rows, default=None)
-        raise longest.error if longest else InputError(path, "no rows of numbers", "a header and numbers")
+        raise (
+            longest.error
+            if longest
+            else InputError(path, "it has no rows of numbers", "a recording needs a header and numbers")
+        )
     if len(fitting) > 1 and sheet != ALL:
-        problem = f"the columns in {len(fitting)} of the tables {labels}"
-        raise InputError(path, problem, "one table; or import with --sheet NAME, or --sheet all")
+        problem = f"{len(fitting)} of its tables {', '.join(map(repr, labels))} can be recordings"
+        raise InputError(path, problem, "import with --sheet NAME, or with --sheet all")
     readable = []
     for entry in fitting:
         if isinstance(entry.table, InputError):
@@ -203,13 +202,13 @@ def _reading(
 
 
 def _read_stored(path: Path) -> Recording:
-    refuse_damaged(path, "a bayeskin Recording file")
+    refuse_damaged(path, "a Recording in its own HDF5 form")
     recording = storage.load(path, Recording)
     arrays = [recording.time_s, recording.displacement_m, recording.force_n]
     valid = len({a.shape for a in arrays}) == 1 and all(a.ndim == 1 and a.dtype.kind == "f" for a in arrays)
     if not valid:
         raise InputError(
-            path, "arrays of different shapes or types", "three arrays of numbers with equal lengths"
+            path, "its arrays differ in shape or type", "it needs three arrays of numbers with equal lengths"
         )
     refuse_invalid(str(path), 0, *arrays)
     return recording

@@ -94,15 +94,15 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
     if travel < 5 * tolerance:
         raise InputError(
             recording.name,
-            f"a displacement that moves {travel:.3g} m, little more than its noise",
-            "loading and unloading",
+            f"the displacement moves {travel:.3g} m, little more than its noise",
+            "a test needs loading and unloading",
         )
     knots = simplify(time_s, smooth, tolerance, np.empty(0, dtype=np.int64))
     still_m = SEGMENT.still * travel
     pieces = _merge(_fragments(time_s, smooth, knots, still_m), time_s, smooth, still_m)
     if not any(piece.direction for piece in pieces):
         raise InputError(
-            recording.name, "a displacement that never rises or falls", "a loading or an unloading"
+            recording.name, "the displacement never rises or falls", "a test needs a loading or an unloading"
         )
     corners = [_corner_s(time_s, smooth, a, b) for a, b in pairwise(pieces)]
     edges = [float(time_s[0]), *corners, float(time_s[-1])]

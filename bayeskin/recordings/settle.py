@@ -79,8 +79,8 @@ def _decimal_sign(table: Table) -> str:
     """Returns the decimal sign that makes numbers of all cells, and under which time increases."""
     common = set.intersection(*(set(numbers.read) for numbers in table.numbers.values()))
     if not common:
-        found = "columns with a point as their decimal sign beside columns with a comma"
-        raise InputError(table.place, found, "one decimal sign")
+        problem = "the decimal sign is a point in some columns and a comma in others"
+        raise InputError(table.place, problem, "use the same decimal sign in all columns")
     unclear = next((numbers.example for numbers in table.numbers.values() if numbers.example), "")
     if len(common) == 2 and unclear:
         clocks = [table.numbers[column.index] for column in table.candidates["time"]]
@@ -88,8 +88,8 @@ def _decimal_sign(table: Table) -> str:
     if len(common) == 1 or (common and not unclear):
         return min(common, key=".,".index)
     decimal, grouped = unclear.replace(",", "."), unclear.replace(",", "").replace(".", "")
-    found = f"numbers such as {unclear!r}, which may be {decimal} or {grouped}"
-    raise InputError(table.place, found, "numbers without thousands separators")
+    problem = f"numbers such as {unclear!r} may be {decimal} or {grouped}"
+    raise InputError(table.place, problem, "write numbers without thousands separators")
 
 
 def _chosen(table: Table, raw: Mapping[int, Array], stated: Stated) -> tuple[dict[str, Column], list[str]]:
@@ -102,8 +102,8 @@ def _chosen(table: Table, raw: Mapping[int, Array], stated: Stated) -> tuple[dic
         apart = [v for v in values[1:] if not _equal(values[0], v)]
         if apart:
             names = " and ".join(c.label for c in moving)
-            expected = f"one {quantity} column; or import with --{quantity} NAME or NUMBER"
-            raise InputError(table.place, f"{names}, each a {quantity} column", expected)
+            remedy = f"choose one: import with --{quantity} NAME or NUMBER"
+            raise InputError(table.place, f"{names} are {quantity} columns", remedy)
         chosen[quantity] = moving[0]
         notes += [f"column {c.label} holds the same as {moving[0].label}" for c in moving[1:]]
         notes += [f"column {c.label} never changes" for c in still]
@@ -157,10 +157,11 @@ def _zeroed(table: Table, displacement_m: Array, stated: Stated) -> tuple[Array,
     if stated.zero:
         return displacement_m - start_m, start_m, [f"--zero subtracted the first displacement, {start_mm}"]
     if stated.zero is None and abs(start_m) > SETTLE.at_zero * travel_m:
-        expected = (
-            "0 where the skin is at rest; or import with --zero to subtract it, or --no-zero to keep it"
+        remedy = (
+            "it must be 0 where the skin is at rest; import with --zero to subtract it, "
+            "or with --no-zero to keep it"
         )
-        raise InputError(table.place, f"a displacement that starts at {start_mm}", expected)
+        raise InputError(table.place, f"the displacement starts at {start_mm}", remedy)
     if abs(start_m) > SETTLE.reported * travel_m:
         return displacement_m, 0.0, [f"the displacement starts at {start_mm}, which was kept"]
     return displacement_m, 0.0, []
@@ -185,10 +186,10 @@ def _refuse_negative_pull(
     options = " ".join(f"--unit {q}=-{units[q]}" for q, turn in turned.items() if turn)
     if closing:
         force = "rises" if opposed else "falls"
-        found = f"a displacement that goes to {1e3 * lowest_m:.4g} mm while the force {force}"
+        problem = f"the displacement goes to {1e3 * lowest_m:.4g} mm while the force {force}"
         kept = f"--unit displacement=+{units['displacement']} if the pads came closer"
     else:
-        found = "a force and a displacement of which one falls while the other rises"
+        problem = "force or displacement falls while the other rises"
         kept = f"--unit force=+{units['force']} if this is right"
-    expected = f"a pull that counts positive; or import with {options} to turn it, or {kept}"
-    raise InputError(table.place, found, expected)
+    remedy = f"a pull must count positive; import with {options} to turn it, or {kept}"
+    raise InputError(table.place, problem, remedy)

@@ -145,11 +145,13 @@ def _refuse_interruption(where: str, above: Sequence[Line], first: NumberedRow, 
     """Raises InputError for numbers that continue the table above them after rows without numbers."""
     if not above:
         raise InputError(
-            f"{where}, row {first[0] - 1}", f"an empty row before row {first[0]}", "a row of numbers"
+            f"{where}, row {first[0] - 1}",
+            f"it is empty, although numbers follow in row {first[0]}",
+            "rows of numbers must follow each other",
         )
     if len(_texts(first[1])) == width and not any(names_quantities(texts) >= 2 for _, texts in above):
-        problem = f"{' '.join(above[0][1])[:60]!r} between rows of numbers"
-        raise InputError(f"{where}, row {above[0][0]}", problem, "a row of numbers")
+        problem = f"{' '.join(above[0][1])[:60]!r} stands between rows of numbers"
+        raise InputError(f"{where}, row {above[0][0]}", problem, "rows of numbers must follow each other")
 
 
 def _heading(where: str, above: Sequence[Line], first: NumberedRow) -> Heading:
@@ -162,12 +164,12 @@ def _heading(where: str, above: Sequence[Line], first: NumberedRow) -> Heading:
         units = tuple(lines.pop(0)[1])
     named = lines[0] if lines else (number, [])
     if len(named[1]) > 1 and width == 2 * len(named[1]):
-        problem = f"{len(named[1])} names above rows of {width} cells"
+        problem = f"{len(named[1])} names stand above rows of {width} cells"
         raise InputError(
-            f"{where}, row {named[0]}", problem, "a delimiter that is not the decimal sign as well"
+            f"{where}, row {named[0]}", problem, "the delimiter must not be the decimal sign as well"
         )
     if len(named[1]) < width:
-        said = f"{' '.join(named[1])[:80]!r}" if lines else "no names"
+        said = f"only {' '.join(named[1])[:80]!r} stands" if lines else "no names stand"
         fault = f"{said} above rows of {width} cells"
         return Heading(named[0], ("",) * width, _filled(units, width), fault=fault)
     names = (without_comment(named[1][0]), *named[1][1:])
@@ -239,7 +241,9 @@ class _Reader:
         for number, row in takewhile(lambda row: row[0] < end, rows):
             if any(i < len(row) and is_number(row[i]) for i in needed):
                 raise InputError(
-                    f"{self.where}, row {number}", "numbers below an empty cell", "no gap in a column"
+                    f"{self.where}, row {number}",
+                    "it has numbers below an empty cell",
+                    "a column must not have a gap",
                 )
 
     def _end(self, needed: dict[int, Numbers], chunk: Sequence[NumberedRow]) -> int:
@@ -251,7 +255,9 @@ class _Reader:
             if bad and bad[0] >= len(row):
                 raise self._ragged(number, row)
             if bad:
-                raise InputError(self._place(number, bad[0]), describe_cell(row[bad[0]]), "a number")
+                raise InputError(
+                    self._place(number, bad[0]), describe_cell(row[bad[0]]), "it must be a number"
+                )
         return len(chunk)
 
     def _parsed(self, i: int, numbers: Numbers, chunk: Sequence[NumberedRow]) -> dict[str, Array]:
@@ -260,8 +266,10 @@ class _Reader:
         try:
             return numbers.parsed(cells)
         except ValueError:
-            k, expected = numbers.first_wrong(cells)
-            raise InputError(self._place(chunk[k][0], i), repr(cells[k])[:60], expected) from None
+            k, remedy = numbers.first_wrong(cells)
+            raise InputError(
+                self._place(chunk[k][0], i), f"the cell contains {cells[k]!r}"[:80], remedy
+            ) from None
 
     def _place(self, number: int, i: int) -> str:
         return f"{self.where}, row {number}, column {self.heading.names[i].strip() or i + 1!r}"
@@ -282,11 +290,10 @@ class _Reader:
             pairs = ((str(row[left]), str(row[left + 1])) for _, row in chunk)
             if all(_THOUSANDS.fullmatch(a) and _GROUP.fullmatch(b) for a, b in pairs):
                 number, row = chunk[0]
-                found = (
-                    f"'{row[left]} {row[left + 1]}' in columns {left + 1} and {left + 2}, maybe one number"
-                )
-                raise InputError(f"{self.where}, row {number}", found, "another delimiter than blanks")
+                cells = f"'{row[left]} {row[left + 1]}' in columns {left + 1} and {left + 2}"
+                problem = f"{cells} may be one number"
+                raise InputError(f"{self.where}, row {number}", problem, "use another delimiter than blanks")
 
     def _ragged(self, number: int, row: Row) -> InputError:
-        expected = f"{len(self.heading.names)} cells, as in the header"
-        return InputError(f"{self.where}, row {number}", f"{len(row)} cells", expected)
+        remedy = f"it must be {len(self.heading.names)}, as in the header"
+        return InputError(f"{self.where}, row {number}", f"the number of cells is {len(row)}", remedy)

@@ -51,17 +51,23 @@ def rows_of_text(path: Path, data: bytes) -> tuple[Rows, str, tuple[str, ...]]:
     InputError : the file is empty, or no text in a known encoding, or has no rows of numbers near its start.
     """
     if not data.strip(b"\0 \t\r\n"):
-        raise InputError(path, "an empty file", "a header row and rows of numbers")
+        raise InputError(path, "the file is empty", "a recording needs a header row and rows of numbers")
     decoded = list(_decoded(path, data))
     if not decoded:
-        raise InputError(path, "bytes that are not text", "text in UTF-8, UTF-16, Windows-1252 or Shift-JIS")
+        raise InputError(
+            path, "it is not text", "bayeskin needs text in UTF-8, UTF-16, Windows-1252 or Shift-JIS"
+        )
     ways = [(text, encoding, delimiter) for text, encoding in decoded for delimiter in _DELIMITERS]
     starts = [_start(text, delimiter) for text, _, delimiter in ways]
     fitting = [i for i, start in enumerate(starts) if start is not None]
     if not fitting:
         first = next((line.strip() for line in _lines(decoded[0][0]) if line.strip()), "")
-        problem = f"no rows of numbers near its start (the first line is {first[:60]!r})"
-        raise InputError(path, problem, "a header that names time, displacement and force, and its numbers")
+        problem = f"it has no rows of numbers near its start (the first line is {first[:60]!r})"
+        raise InputError(
+            path,
+            problem,
+            "a recording needs a header that names time, displacement and force, and its numbers",
+        )
     headed = (i for i in fitting if any(names_quantities(row) >= 2 for row in (starts[i] or [])[-3:]))
     text, encoding, delimiter = ways[next(headed, fitting[0])]
     notes = () if encoding == "utf-8" else (f"text read as {encoding}",)
@@ -112,7 +118,11 @@ def _without_nuls(path: Path, text: str) -> str:
         return text
     text = re.sub(r"(?<![\d.,])\0+|\0+(?![\d.,])", "", text)
     if "\0" in text:
-        raise InputError(path, "bytes that are not text (NUL within a number)", "a text file, or a workbook")
+        raise InputError(
+            path,
+            "it is not text (there is a NUL within a number)",
+            "bayeskin needs a text file, or a workbook",
+        )
     return text
 
 

@@ -15,8 +15,19 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.recordings.text import NumberedRow, Rows
 
+WORKBOOKS = (".xlsx", ".xlsm", ".xls")  # the endings of workbooks
 MOST_UNPACKED = 2**30  # bytes of a workbook's parts; a sheet of a million rows with three columns has 10^8
 _MOST_ROWS, _MOST_COLUMNS = 2**20, 4096  # a sheet cannot have more rows, and a recording needs few columns
+_EARLY_EXCEL = (b"\x09\x00", b"\x09\x02", b"\x09\x04", b"\x09\x08")  # the first record of a workbook
+
+
+def sheets_of_workbook(path: Path, kind: str, data: bytes) -> Mapping[str, Rows] | None:
+    """Returns the rows of the sheets of a workbook, or None for a text. The content decides, not the name."""
+    if data.startswith(b"PK\x03\x04") or kind in (".xlsx", ".xlsm"):
+        return sheets_of_xlsx(path, data)
+    if data.startswith(b"\xd0\xcf\x11\xe0") or (kind == ".xls" and data[:2] in _EARLY_EXCEL):
+        return sheets_of_xls(path, data)
+    return None
 
 
 def sheets_of_xlsx(path: Path, data: bytes) -> Mapping[str, Rows]:
@@ -35,7 +46,9 @@ def sheets_of_xlsx(path: Path, data: bytes) -> Mapping[str, Rows]:
         with zipfile.ZipFile(io.BytesIO(data)) as parts:
             unpacked = sum(part.file_size for part in parts.infolist())
         if unpacked > MOST_UNPACKED:
-            raise InputError(path, f"{unpacked:.2g} bytes when unpacked", f"at most {MOST_UNPACKED:.2g}")
+            raise InputError(
+                path, f"it has {unpacked:.2g} bytes when unpacked", f"it can have at most {MOST_UNPACKED:.2g}"
+            )
         book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
         sheets = [sheet for sheet in book.worksheets if hasattr(sheet, "reset_dimensions")]
         return {sheet.title: partial(rows, sheet) for sheet in sheets}
@@ -84,13 +97,17 @@ def rows_of_array(path: Path, data: bytes) -> Rows:
         }
         shape, _, dtype = read_header[version](file)
         if dtype.hasobject or np.prod(shape, dtype=float) * dtype.itemsize > len(data):
-            raise InputError(path, f"an array of shape {shape} and type {dtype}", expected)
+            raise InputError(
+                path, f"it contains an array of shape {shape} and type {dtype}", f"bayeskin needs {expected}"
+            )
         file.seek(0)
         array = np.load(file, allow_pickle=False)
         names = array.dtype.names
         columns = [array[name] for name in names] if names else list(array.T) if array.ndim == 2 else []
         if not columns or any(c.ndim != 1 or c.dtype.kind not in "iuf" for c in columns):
-            raise InputError(path, f"an array of shape {shape} and type {dtype}", expected)
+            raise InputError(
+                path, f"it contains an array of shape {shape} and type {dtype}", f"bayeskin needs {expected}"
+            )
     header = [names] if names else []
     return lambda: enumerate([*header, *zip(*(c.tolist() for c in columns), strict=True)], start=1)
 
@@ -100,8 +117,10 @@ def _guarded(path: Path, rows: Iterable[Sequence[Any]]) -> Iterator[NumberedRow]
     with _faults_named(path, "a workbook"):
         for number, row in enumerate(rows, start=1):
             if number > _MOST_ROWS or len(row) > _MOST_COLUMNS:
-                found = f"a sheet with {number} rows and {len(row)} columns or more"
-                raise InputError(path, found, f"at most {_MOST_ROWS} rows and {_MOST_COLUMNS} columns")
+                problem = f"a sheet has {number} rows and {len(row)} columns or more"
+                raise InputError(
+                    path, problem, f"it can have at most {_MOST_ROWS} rows and {_MOST_COLUMNS} columns"
+                )
             yield number, row
 
 
@@ -114,5 +133,5 @@ def _faults_named(path: Path, expected: str) -> Iterator[None]:
         raise
     except Exception as error:  # openpyxl, xlrd and numpy pass on any exception of the layers below them
         said = " ".join(str(error).split())[:120]
-        problem = f"a file that cannot be read ({type(error).__name__}: {said})"
-        raise InputError(path, problem, expected) from None
+        problem = f"it cannot be read ({type(error).__name__}: {said})"
+        raise InputError(path, problem, f"bayeskin needs {expected}") from None

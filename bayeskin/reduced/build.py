@@ -35,12 +35,12 @@ class BuildSettings:
     """Sizes of a reduced model and of its training.
 
     base_runs, runs : number of full runs of the base model, and of each mechanism
-    first_runs : number of full runs of a first base model, which can be used while the others are made
+    first_base_runs, first_runs : the same numbers for a first model, which can be used meanwhile
     base : numbers of displacement and pressure modes of the base model
     each : numbers of displacement and pressure modes that each mechanism adds to the base's
     base_points, set_points : number of cubature points of the base model, and of sets of mechanisms
     base_shadows, set_shadows : number of reduced runs that train the cubature of each
-    first_shadows : number of those that train the cubature of the first base model
+    first_base_shadows : number of those that train the cubature of the first base model
     trusted : largest force that the points may leave out in a reduced run, as a fraction of its peak force; a
         cubature does not learn from runs that leave out more
     seed : random seed of the full runs; the reduced runs that train cubatures use seed + 1
@@ -48,22 +48,25 @@ class BuildSettings:
 
     base_runs: int = 128
     runs: int = 48
-    first_runs: int = 64
+    first_base_runs: int = 64
+    first_runs: int = 24
     base: tuple[int, int] = (76, 72)
     each: tuple[int, int] = (30, 20)
     base_points: int = 450
     set_points: int = 800
     base_shadows: int = 80
     set_shadows: int = 120
-    first_shadows: int = 64
+    first_base_shadows: int = 64
     trusted: float = 0.1
     seed: int = 1
     cubature: CubatureSettings = field(default_factory=CubatureSettings)
 
     @property
     def first(self) -> BuildSettings:
-        """Returns the settings of the first base model."""
-        return replace(self, base_runs=self.first_runs, base_shadows=self.first_shadows)
+        """Returns the settings of the first model."""
+        return replace(
+            self, base_runs=self.first_base_runs, base_shadows=self.first_base_shadows, runs=self.first_runs
+        )
 
     def cases(self, trained: Trained, kind: str) -> list[Case]:
         """Returns the cases of the full runs of a kind."""
@@ -118,7 +121,7 @@ def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Mo
     """
     finished = [run for run in map(full.read, cases) if not run.message]
     if not finished:
-        raise InputError(full.store.path, "no full run that finished", "at least one")
+        raise InputError(full.store.path, "no full run has finished", "at least one must finish")
 
     def weighted(name: str, product: sp.csr_matrix) -> Array:
         rows = np.concatenate([getattr(run, name) for run in finished]).astype(float)
@@ -167,13 +170,16 @@ class Teacher:
             runs: dict[int, Taken] = {}
             for number, run in run_all(replace(self, known=rule), items):
                 if isinstance(run, Lost):
-                    raise InputError(self.label, run.reason, "a worker that finishes a reduced run")
+                    raise InputError(self.label, run.reason, "run the same command again")
                 runs[number] = run
                 progress(self.label, (done + len(runs)) / len(cases))
             rows += [runs[number].rows for number in sorted(runs) if self._is_near(runs[number])]
             if not rows:
-                message = "no reduced run close to the full model"
-                raise InputError(self.label, message, "parameters without folding of the skin")
+                raise InputError(
+                    self.label,
+                    "no reduced run is close to the full model",
+                    "use parameters with which the skin does not fold",
+                )
             all_rows = with_volumes(np.concatenate(rows), at, self.settings.cubature)
             rule = choose_points(all_rows, [points], self.settings.cubature)[points][0]
             done = end

@@ -37,6 +37,7 @@ class CubatureSettings:
     volume : weight of the rows for the volumes of the layers
     most : largest norm of a row; states with larger rows are scaled down, so that no state outweighs the rest
     batch : number of points that are added at once
+    exact : relative residual that counts as zero; further points would change nothing
     """
 
     every: int = 5
@@ -47,6 +48,7 @@ class CubatureSettings:
     volume: float = 1.0
     most: float = 20.0
     batch: int = 8
+    exact: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,8 @@ def choose_points(
 ) -> dict[int, tuple[Rule, float]]:
     """Returns cubatures for rows (r, n), each with its relative residual, by the wanted number of points.
 
-    counts : wanted numbers of points, in increasing order; a cubature has about that many points
+    counts : wanted numbers of points, in increasing order. A cubature has about that many points, or fewer
+        where fewer are exact. It never needs more points than there are rows
     """
     right = rows.sum(axis=1, dtype=np.float64)
     norm = np.sqrt(np.einsum("ij,ij->j", rows, rows, dtype=np.float64))
@@ -142,8 +145,8 @@ def choose_points(
         new = np.argpartition(-gain, count)[:count]
         kept = fit.add(rows[:, new].astype(np.float64))
         points = np.concatenate([points, new])[kept]
-        if len(points) >= wanted[0]:
-            remaining = float(np.linalg.norm(fit.left()) / np.linalg.norm(right))
+        remaining = float(np.linalg.norm(fit.left()) / np.linalg.norm(right))
+        while wanted and (len(points) >= wanted[0] or remaining < settings.exact):
             rules[wanted.pop(0)] = Rule(points.copy(), fit.factor.copy()), remaining
     return rules
 

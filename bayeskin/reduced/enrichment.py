@@ -158,8 +158,8 @@ def _library(
     if not finished:
         raise InputError(
             "enrichment",
-            "no full run that finishes near this point",
-            "parameters without folding of the skin",
+            "no full run near this point finishes",
+            "use parameters with which the skin does not fold",
         )
     modes = Modes(
         _largest_modes([run.displacement for run in finished], inner.displacement, settings, 0),

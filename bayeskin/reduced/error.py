@@ -22,7 +22,7 @@ from bayeskin.reduced.equations import REMEMBERED_STATES
 from bayeskin.reduced.operators import Basis
 from bayeskin.types import Array
 
-SAME_PLACE = 0.6  # of the largest displacement; an adjoint is used again for states whose pads are this near
+SAME_PLACE = 0.6  # an adjoint is used again within this share of the largest displacement
 
 
 class DualWeightedResidual:

@@ -94,21 +94,29 @@ def trained_geometry(path: Path) -> Geometry | None:
         return _geometry(json.loads(handle.attrs["manifest"])["geometry"])
 
 
-@lru_cache(maxsize=4)
 def load_reduced(path: Path) -> ReducedModel:
-    """Returns the reduced model that `save_reduced` wrote.
+    """Returns the reduced model that `save_reduced` wrote; a file is read again only if it has been replaced.
 
     Raises InputError if the file is absent, truncated, altered or of another kind, or if the model was made
     from another version of the full model or of a mechanism's law.
     """
+    status = path.stat() if path.is_file() else None
+    return _loaded(path, () if status is None else (status.st_ino, status.st_mtime_ns, status.st_size))
+
+
+@lru_cache(maxsize=4)
+def _loaded(path: Path, state: tuple[int, ...]) -> ReducedModel:
+    """Returns the reduced model in a file; `state` differs when the file has been replaced."""
     with storage.reading(path, EXPECTED) as handle:
         if handle.attrs.get("format") != FORMAT:
-            raise InputError(path, "an HDF5 file of another origin", EXPECTED)
+            raise InputError(path, "it is an HDF5 file of another origin", f"bayeskin needs {EXPECTED}")
         version = int(handle.attrs["format_version"])
         if version != FORMAT_VERSION:
-            raise InputError(path, f"format version {version}", f"format version {FORMAT_VERSION}")
+            raise InputError(path, f"the version of its format is {version}", f"it must be {FORMAT_VERSION}")
         if storage.contents_hash(handle) != handle.attrs["arrays_sha256"]:
-            raise InputError(path, "contents that differ from their stored hash", "an unaltered file")
+            raise InputError(
+                path, "its contents differ from their stored hash", "bayeskin needs an unaltered file"
+            )
         manifest = json.loads(handle.attrs["manifest"])
         model = ReducedModel(
             trained=Trained(
@@ -144,10 +152,10 @@ def _geometry(said: Mapping[str, Any]) -> Geometry:
 
 def _check_versions(path: Path, model: ReducedModel, laws: Mapping[str, str]) -> None:
     spec = ModelSpec(refinement=model.refinement, geometry=model.trained.geometry)
-    remedy = "a model of this version (run `bayeskin reduce` again)"
+    remedy = "run `bayeskin reduce` again"
     if model.full_hash != spec.hash:
-        raise InputError(path, "a reduced model of another version of the full model", remedy)
+        raise InputError(path, "it belongs to another version of the full model", remedy)
     known = catalogue()
     for name, digest in laws.items():
         if name not in known or law_hashes([name])[name] != digest:
-            raise InputError(path, f"a reduced model of another version of {name}", remedy)
+            raise InputError(path, f"it belongs to another version of the mechanism {name}", remedy)

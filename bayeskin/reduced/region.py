@@ -23,9 +23,9 @@ class RegionSettings:
     """Settings of the region in which a reduced model is trusted.
 
     least_stiffness : smallest eigenvalue of the stiffness, relative to rest (docs/reduced.md)
-    least_stiffness_if_checked : the same where runs of the full model check the results; nearer to folding
-        the reduced model is of no use
-    low : of the largest displacement; the stiffness is checked at corners below it
+    least_stiffness_if_checked : the same where runs of the full model check the results. Nearer to folding
+        the reduced model cannot be used
+    low : the stiffness is checked at corners below this share of the largest displacement
     faster : largest allowed speed over the fastest in training; the skin is undrained at both
     """
 

@@ -51,7 +51,7 @@ class FullRuns:
         for number, result in run_all(partial(full_run, self.spec), todo):
             if isinstance(result, Lost):
                 where = f"full run with {', '.join(todo[number].mechanisms) or 'no mechanism'}"
-                raise InputError(where, result.reason, "a worker that finishes this run")
+                raise InputError(where, result.reason, "run the same command again")
             self.store.add(depends_on(self.spec, todo[number]), result)
             done += 1
             progress("full runs", done / len(wanted))

@@ -78,7 +78,9 @@ class ReducedGradients:
     ) -> None:  # fmt: skip
         unknown = [name for name in changes if name not in theta]
         if unknown:
-            raise InputError("gradients", unknown[0], f"one of {', '.join(theta)}")
+            raise InputError(
+                "gradients", f"{unknown[0]} is not a parameter of the run", f"use some of {', '.join(theta)}"
+            )
         self.names = tuple(changes)
         self._equations = equations
         self._moved: dict[int, list[ReducedEquations]] = {}

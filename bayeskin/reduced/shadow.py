@@ -36,7 +36,7 @@ class Shadow:
     ) -> None:
         self.equations = ReducedEquations(whole, theta, binds, protocol)
         self._start = self.equations.initial_state(theta["p_init"])
-        self._known: dict[int, tuple[State, State]] = {}  # by id of the run's state, which is kept
+        self._known: dict[int, tuple[State, State]] = {}  # keys: id of the run's state, which is kept
 
     def follow(self, stage: Stage, time_s: float) -> Followed | None:
         """Returns a stage at all points, or None where a point is inside out.

@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class TangentSettings:
-    """Settings of the keeping of tangents.
+    """Settings with which tangents are kept.
 
     most : largest number of tangents that are kept
     same_place : a kept tangent this near to a new one is replaced by it

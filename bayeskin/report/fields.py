@@ -125,17 +125,29 @@ def _check(
 ) -> None:
     """Raises InputError if the shapes do not match."""
     if points.ndim != 3 or points.shape[0] != len(row_labels) or points.shape[2] != 3:
-        raise InputError("points of the surface", f"shape {points.shape}", f"({len(row_labels)}, v, 3)")
+        raise InputError(
+            "points of the surface", f"the shape is {points.shape}", f"it must be ({len(row_labels)}, v, 3)"
+        )
     if faces.ndim != 2 or faces.shape[1] not in (3, 4) or faces.max(initial=0) >= points.shape[1]:
-        raise InputError("faces of the surface", f"shape {faces.shape}", "(f, 3) or (f, 4) numbers of points")
+        raise InputError(
+            "faces of the surface",
+            f"the shape is {faces.shape}",
+            "it must be (f, 3) or (f, 4), with numbers of points",
+        )
     if part.shape != faces.shape[:1]:
-        raise InputError("parts of the surface", f"shape {part.shape}", str(faces.shape[:1]))
-    expected = (len(row_labels), len(faces))
+        raise InputError(
+            "parts of the surface", f"the shape is {part.shape}", f"it must be {faces.shape[:1]}"
+        )
+    shape = (len(row_labels), len(faces))
     for field in columns:
-        if np.shape(field.values) != expected:
-            raise InputError(field.label, f"shape {np.shape(field.values)}", str(expected))
-        if field.directions is not None and np.shape(field.directions) != (*expected, 3):
-            raise InputError(field.label, f"shape {np.shape(field.directions)}", str((*expected, 3)))
+        if np.shape(field.values) != shape:
+            raise InputError(field.label, f"the shape is {np.shape(field.values)}", f"it must be {shape}")
+        if field.directions is not None and np.shape(field.directions) != (*shape, 3):
+            raise InputError(
+                field.label,
+                f"the shape of its directions is {np.shape(field.directions)}",
+                f"it must be {(*shape, 3)}",
+            )
 
 
 def _view() -> Array:

@@ -48,7 +48,9 @@ def figure_posterior(
     chosen = list(space.names if names is None else names)
     for name in chosen:
         if name not in space.names:
-            raise InputError("names of the corner plot", repr(name), f"one of {', '.join(space.names)}")
+            raise InputError(
+                "names of the corner plot", f"{name!r} is not known", f"use some of {', '.join(space.names)}"
+            )
     parameters = [space.parameters[space.names.index(name)] for name in chosen]
     columns = [axis_values(p, draws[:, space.names.index(p.name)]) for p in parameters]
     best = [axis_values(p, map_theta[p.name]) if p.name in map_theta else np.nan for p in parameters]

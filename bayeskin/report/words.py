@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from bayeskin.inference.identify import Informed, grade_of
 from bayeskin.number_format import interval, number, quantity
+
+ADDS = 1.2  # a recording adds something where an interval would be wider by this factor without it
 
 
 def prior_in_words(prior: Mapping[str, Any], unit: str) -> str:
@@ -44,3 +47,28 @@ def full_run_in_words(full: Mapping[str, Any]) -> str:
         f"an RMSE of {quantity(full['rmse'], 'N')}. The fitted model differs from it by "
         f"{quantity(full['fit_off_by'], 'N')} there."
     )
+
+
+def agreement_in_words(recording: Mapping[str, Any]) -> str:
+    """Returns how well one of several recordings agrees with the others."""
+    name, rms_n, tension = recording["name"], recording["rms_n"], recording["tension"]
+    residual = f"RMS residual {1e3 * rms_n:.1f} mN, {rms_n / recording['noise_n']:.1f} sd of its noise"
+    if tension is None:
+        return f"{name}: {residual}; it could not be fitted alone"
+    verb = "contradicts" if recording["contradicts"] else "agrees with"
+    return f"{name} {verb} the others, by {max(tension, 0.0):.1f} sd: {residual}"
+
+
+def informed_in_words(recording: Mapping[str, Any]) -> str:
+    """Returns what one of several recordings says about the skin, and what it adds to the others."""
+    grades: dict[Informed, list[str]] = {grade: [] for grade in Informed}
+    for name, sd in recording["sd_alone"].items():
+        grades[grade_of(1.0 - sd**2)].append(name)
+    well, weakly = grades[Informed.WELL], grades[Informed.WEAKLY]
+    informs = [", ".join(well)] if well else []
+    informs += [f"weakly {', '.join(weakly)}"] if weakly else []
+    adds = [f"{name} {factor:.1f}" for name, factor in recording["widens"].items() if factor >= ADDS]
+    line = f"{recording['name']} alone informs {' and '.join(informs) or 'no parameter of the skin'}"
+    if not adds:
+        return f"{line}; without it, no interval would be much wider"
+    return f"{line}; without it, the intervals would be wider by these factors: {', '.join(adds)}"

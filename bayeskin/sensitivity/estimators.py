@@ -122,8 +122,11 @@ def projection(
     unit, fresh = (_sobol_points(space.dim, samples, rng) for _ in range(2))
     indices = _expansion_terms(space.dim, len(unit) // 4)
     if len(indices) == 1:
-        expected = f"at least {4 * (space.dim + 1)} with {space.dim} parameters"
-        raise InputError("sobol.samples", samples, expected)
+        raise InputError(
+            "sobol.samples",
+            f"{samples} samples are too few",
+            f"use at least {4 * (space.dim + 1)} with {space.dim} parameters",
+        )
     basis = legendre_basis(unit, indices)
     gram = cho_factor(basis.T @ basis)
 

@@ -45,7 +45,9 @@ def sobol(
     """
     space = surrogate.space if space is None else space
     if space.names != surrogate.space.names or not surrogate.space.contains([space.lower, space.upper]).all():
-        raise InputError("sobol: space", describe(space), f"a box within {describe(surrogate.space)}")
+        raise InputError(
+            "sobol: space", f"it is {describe(space)}", f"it must be a box within {describe(surrogate.space)}"
+        )
     draws = error_draws(surrogate, rng)
     estimate = pick_freeze if method == "pick-freeze" else projection
     return estimate(surrogate.predict_mean, space, surrogate.edges_s, rng, samples, draws)

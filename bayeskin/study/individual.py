@@ -42,18 +42,28 @@ class Individual(FreezesArrays):
         super().__post_init__()
         where, shape = f"posterior of {self.recording}", np.shape(self.draws)
         if len(shape) != 2 or shape[1] != self.space.dim:
-            raise InputError(where, f"draws of shape {shape}", f"{self.space.dim} columns")
+            raise InputError(
+                where, f"the shape of its draws is {shape}", f"they need {self.space.dim} columns"
+            )
         if len(self.draws) < FEWEST_DRAWS:
-            raise InputError(where, f"{len(self.draws)} draws", f"at least {FEWEST_DRAWS}")
+            raise InputError(
+                where, f"{len(self.draws)} draws are too few", f"at least {FEWEST_DRAWS} are needed"
+            )
         for parameter, column in zip(self.space.parameters, self.draws.T, strict=True):
             at = f"{where}: {parameter.name}"
             if not parameter.lower > 0:
-                raise InputError(at, f"a prior from {parameter.lower:g}", "a prior of positive values only")
+                raise InputError(
+                    at,
+                    f"the prior begins at {parameter.lower:g}",
+                    "a study needs priors of positive values only",
+                )
             if not np.all((column >= parameter.lower) & (column <= parameter.upper)):
-                raise InputError(at, "draws outside the bounds of the prior", "draws within the bounds")
+                raise InputError(
+                    at, "some draws lie outside the bounds of the prior", "all must lie within them"
+                )
             if 2 * len(np.unique(column)) < len(column):
                 raise InputError(
-                    at, "draws that are mostly repeated", "thinned draws, of which few are alike"
+                    at, "the draws are mostly repeated", "use thinned draws, of which few are alike"
                 )
 
 
@@ -86,8 +96,9 @@ class Likelihoods(FreezesArrays):
         for individual in individuals:
             if individual.space.names != first.space.names:
                 raise InputError(
-                    f"posterior of {individual.recording}", f"parameters {', '.join(individual.space.names)}",
-                    f"{', '.join(first.space.names)}, as in {first.recording}",
+                    f"posterior of {individual.recording}",
+                    f"its parameters are {', '.join(individual.space.names)}",
+                    f"they must be {', '.join(first.space.names)}, as in {first.recording}",
                 )  # fmt: skip
         spaces = tuple(dict.fromkeys(individual.space.without_texts for individual in individuals))
         which = np.array([spaces.index(individual.space.without_texts) for individual in individuals])
@@ -180,7 +191,7 @@ def log_prior(space: ParameterSpace, x: Array) -> Array:
     """Returns the log density (...,) of a prior at logarithms x (..., d) of points within its bounds."""
     theta = np.exp(x)
     offset = np.array([parameter.offset if parameter.in_log else 0.0 for parameter in space.parameters])
-    slopes = np.where(space.is_log, theta / (theta + offset), theta)  # of the line by the logarithm
+    slopes = np.where(space.is_log, theta / (theta + offset), theta)  # d line / d log(theta)
     return np.asarray(space.log_density(space.to_line(theta)) + np.log(slopes).sum(axis=-1))
 
 

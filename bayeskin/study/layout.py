@@ -99,7 +99,7 @@ class Layout(FreezesArrays):
     @property
     def categories(self) -> tuple[Category, ...]:
         """Returns the group and the site, where they have different medians."""
-        return tuple(one for one in (self.group, self.site) if one is not None)
+        return tuple(category for category in (self.group, self.site) if category is not None)
 
     def row(self, group: str) -> Array:
         """Returns the row (p,) of the matrix of a group ("" without groups), averaged over the sites."""
@@ -132,9 +132,9 @@ def _category(name: str, entries: Sequence[Entry], column: int) -> Category | No
 def _matrix(count: int, *categories: Category | None) -> Array:
     """Returns the matrix (N, p) of an intercept and the further values of categories."""
     columns = [np.ones(count)]
-    for one in categories:
-        if one is not None:
-            columns += [(one.value == v).astype(float) for v in range(1, len(one.values))]
+    for category in categories:
+        if category is not None:
+            columns += [(category.value == v).astype(float) for v in range(1, len(category.values))]
     return np.stack(columns, axis=1)
 
 

@@ -20,7 +20,7 @@ class MixtureSettings:
     most_draws : largest number of draws that it is fitted to
     components : numbers of components that are tried after one, in this order
     patience : how many of these numbers may be worse in succession before the search ends
-    rounds, gain : expectation maximisation ends after so many rounds, or when a round gains less than this
+    rounds, gain : expectation maximisation ends after `rounds` rounds, or when one gains less than `gain`
         per draw [nats]
     narrowest : smallest variance of a component, as a share of the variance of all draws
     """

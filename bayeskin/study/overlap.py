@@ -15,7 +15,7 @@ from bayeskin.study.individual import Individual, log_prior
 from bayeskin.study.model import Model, State, log_normal
 from bayeskin.study.result import Overlap
 
-_EVEN = 0.5  # share of effective draws from which on weights count as nearly even
+_EVEN = 0.5  # smallest share of effective draws with which weights count as nearly even
 _DRAWS, _SETS = 2000, 100  # largest numbers of draws of a recording, and of the population's parameters
 
 

@@ -44,15 +44,15 @@ def infer_population(
     layout, likelihoods = Layout.of(entries), Likelihoods.of(individuals, rng)
     model = Model.of(layout, likelihoods.bounds, priors)
     draws, convergence = draw_population(model, likelihoods, rng, settings, progress)
-    learned = [identifiability(one.space, one.draws) for one in individuals]
+    learned = [identifiability(individual.space, individual.draws) for individual in individuals]
     return Population(
         layout, priors,
         tuple(
-            _parameter(column, model, draws, [one.parameters[column] for one in learned])
+            _parameter(column, model, draws, [about.parameters[column] for about in learned])
             for column in range(len(likelihoods.names))
         ),
         _recordings(layout, draws, individuals), _subjects(model, draws),
-        tuple(overlap(n, one, model, draws) for n, one in enumerate(individuals)), convergence,
+        tuple(overlap(n, individual, model, draws) for n, individual in enumerate(individuals)), convergence,
     )  # fmt: skip
 
 
@@ -66,9 +66,9 @@ def _parameter(column: int, model: Model, draws: State, learned: Sequence[Learne
         {group: _estimate(np.exp(coefficients @ layout.row(group))) for group in groups},
         _spread(between), _spread(np.sum(within, axis=0)) if within else None,
         _spread(within[1]) if len(within) > 1 else None,
-        tuple(contrast for one in layout.categories for contrast in _contrasts(one, coefficients)),
-        sum(one.informed is not Informed.NOT for one in learned),
-        sum("lower" in one.leans_on for one in learned), sum("upper" in one.leans_on for one in learned),
+        tuple(contrast for category in layout.categories for contrast in _contrasts(category, coefficients)),
+        sum(about.informed is not Informed.NOT for about in learned),
+        *(sum(side in about.leans_on for about in learned) for side in ("lower", "upper")),
     )  # fmt: skip
 
 
@@ -88,9 +88,9 @@ def _recordings(layout: Layout, draws: State, individuals: Sequence[Individual])
         Shrunk(
             layout.recordings[n], layout.subjects[layout.subject[n]],
             layout.group.of(n) if layout.group else None,
-            tuple(map(_estimate, one.draws.T)), tuple(map(_estimate, np.exp(draws.x[:, n]).T)),
+            tuple(map(_estimate, individual.draws.T)), tuple(map(_estimate, np.exp(draws.x[:, n]).T)),
         )
-        for n, one in enumerate(individuals)
+        for n, individual in enumerate(individuals)
     )  # fmt: skip
 
 

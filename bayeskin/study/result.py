@@ -14,7 +14,7 @@ from bayeskin.study.layout import Layout
 from bayeskin.study.model import Priors
 from bayeskin.types import Parameter
 
-FEWEST_EFFECTIVE = 50.0  # effective draws from which on weighted draws can test a shrunk estimate
+FEWEST_EFFECTIVE = 50.0  # effective draws with which weighted draws can test a shrunk estimate
 _OFF = 0.25  # shift of a shrunk estimate, in its sd, above which the fitted likelihood counts as wrong
 _RESOLVED = 0.1  # ratio of an interval's ends below which a spread has only an upper bound
 
@@ -146,4 +146,4 @@ class Population:
     @property
     def trusted(self) -> bool:
         """Returns whether the draws have converged, and no weighted draws contradict them."""
-        return self.convergence.verdict.trusted and not any(one.contradicts for one in self.overlaps)
+        return self.convergence.verdict.trusted and not any(overlap.contradicts for overlap in self.overlaps)

@@ -22,9 +22,9 @@ class SamplerSettings:
     """Settings of the sampler. A sweep moves all parameters of a walker once.
 
     ensembles, walkers : number of independent ensembles, and even number of walkers in each
-    limits, max_sweeps : the ensembles end when the limits are met, or after so many sweeps
+    limits, max_sweeps : the ensembles end when the limits are met, or after `max_sweeps` sweeps
     first_check, growth : sweeps until the limits are first checked, and factor of the sweeps until the next
-    every, most : every so many sweeps are kept, and at most so many of those make the result
+    every, most : one of `every` sweeps is kept, and at most `most` of these make the result
     start_sds : range of the sds of all levels at the start
     """
 
@@ -104,14 +104,14 @@ def _start(
 
 def _coordinates(state: State) -> Array:
     """Returns the parameters (m, D) whose convergence is judged: B and the log sds of all levels."""
-    sds = [0.5 * np.log(np.diagonal(one, axis1=1, axis2=2)) for one in state.covariances]
+    sds = [0.5 * np.log(np.diagonal(covariance, axis1=1, axis2=2)) for covariance in state.covariances]
     return np.concatenate([state.coefficients.reshape(len(state.x), -1), *sds], axis=1)
 
 
 def _names(model: Model, parameters: Sequence[str]) -> tuple[str, ...]:
     """Returns the names of `_coordinates`."""
     layout = model.layout
-    ratios = [f"{one.name} {value}" for one in layout.categories for value in one.values[1:]]
+    ratios = [f"{category.name} {value}" for category in layout.categories for value in category.values[1:]]
     spreads = [f"spread of {level.name}s" for level in layout.levels] + ["spread of recordings"]
     return tuple(f"{what}, {name}" for what in ("median", *ratios, *spreads) for name in parameters)
 

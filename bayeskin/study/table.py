@@ -16,7 +16,7 @@ from bayeskin.probe import bytes_of, refuse_endless
 MANDATORY, OPTIONAL = ("recording", "subject"), ("site", "group", "session", "device")
 COLUMNS = (*MANDATORY, *OPTIONAL)
 _MOST_BYTES = 1_000_000
-_FEWEST_SUBJECTS = 2  # of the study, and of each of its groups
+_FEWEST_SUBJECTS = 2  # smallest number in the study, and in each group
 _EXPECTED = "a table with one row for each recording"
 
 
@@ -59,11 +59,11 @@ def read_table(path: Path | str) -> tuple[Entry, ...]:
     try:
         text = bytes_of(path, _EXPECTED, _MOST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(path, "bytes that are not text in UTF-8", _EXPECTED) from None
+        raise InputError(path, "it is not text in UTF-8", f"bayeskin needs {_EXPECTED}") from None
     rows = _rows(path, text)
     header = next(rows, None)
     if header is None:
-        raise InputError(path, "no header", f"the columns {', '.join(COLUMNS)}")
+        raise InputError(path, "there is no header", f"write one with columns of {', '.join(COLUMNS)}")
     names = _names(f"{path}, row {header[0]}", header[1])
     entries = tuple(_entry(path, number, names, cells) for number, cells in rows)
     _refuse_recordings_twice(entries)
@@ -83,7 +83,9 @@ def _rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
                 yield reader.line_num, [cell.strip() for cell in cells]
     except csv.Error as error:
         raise InputError(
-            f"{path}, row {reader.line_num}", f"text that is no table ({error})", _EXPECTED
+            f"{path}, row {reader.line_num}",
+            f"it cannot be read as a row of cells ({error})",
+            f"bayeskin needs {_EXPECTED}",
         ) from None
 
 
@@ -92,12 +94,16 @@ def _names(where: str, header: Sequence[str]) -> tuple[str, ...]:
     names = tuple(name.lower() for name in header)
     for name in names:
         if name not in COLUMNS:
-            raise InputError(where, f"the column {name!r}"[:80], f"one of {', '.join(COLUMNS)}")
+            raise InputError(
+                where, f"the column {name[:60]!r} is not known", f"use some of {', '.join(COLUMNS)}"
+            )
         if names.count(name) > 1:
-            raise InputError(where, f"the column {name!r} twice", "each column once")
+            raise InputError(where, f"the column {name!r} occurs twice", "each column can occur once")
     for name in MANDATORY:
         if name not in names:
-            raise InputError(where, f"no column {name!r}", f"the columns {' and '.join(MANDATORY)}")
+            raise InputError(
+                where, f"there is no column {name!r}", f"the columns {' and '.join(MANDATORY)} are needed"
+            )
     return names
 
 
@@ -105,11 +111,13 @@ def _entry(path: Path, number: int, names: Sequence[str], cells: Sequence[str]) 
     """Returns a checked row."""
     where = f"{path}, row {number}"
     if len(cells) != len(names):
-        raise InputError(where, f"{len(cells)} cells", f"{len(names)} cells, as in the header")
+        raise InputError(
+            where, f"the number of cells is {len(cells)}", f"it must be {len(names)}, as in the header"
+        )
     row = dict(zip(names, cells, strict=True))
     for name, cell in row.items():
         if not cell:
-            raise InputError(_at(where, name), "an empty cell", "a value, or no such column")
+            raise InputError(_at(where, name), "the cell is empty", "fill it, or leave out the column")
     files = {name: _file(path, where, name, row) for name in ("recording", "device") if name in row}
     texts = {name: cell for name, cell in row.items() if name not in files}
     return Entry(where, **texts, **files)  # type: ignore[arg-type]
@@ -121,7 +129,7 @@ def _file(table: Path, where: str, name: str, row: Mapping[str, str]) -> Path:
     try:
         refuse_endless(file, f"the file of a {name}")
     except InputError as error:
-        raise InputError(_at(where, name), f"{row[name]!r}: {error.found}"[:200], error.expected) from None
+        raise InputError(_at(where, name), f"{row[name]!r}: {error.problem}"[:200], error.remedy) from None
     return file
 
 
@@ -131,8 +139,8 @@ def _refuse_recordings_twice(entries: Sequence[Entry]) -> None:
         file = os.path.realpath(entry.recording)
         if file in seen:
             raise InputError(
-                _at(entry.where, "recording"), f"{entry.recording.name}, which is also in {seen[file]}",
-                "each recording in one row",
+                _at(entry.where, "recording"), f"{entry.recording.name} is also in {seen[file]}",
+                "a recording can be in one row only",
             )  # fmt: skip
         seen[file] = entry.where
 
@@ -148,8 +156,8 @@ def _of_different_names(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     for entry in named:
         if entry.name in seen:
             raise InputError(
-                _at(entry.where, "recording"), f"{entry.recording.name}, named {entry.name} as in "
-                f"{seen[entry.name]}", "files of different names for each subject",
+                _at(entry.where, "recording"), f"{entry.recording.name} would be named {entry.name}, "
+                f"as in {seen[entry.name]}", "the files of a subject need different names",
             )  # fmt: skip
         seen[entry.name] = entry.where
     return named
@@ -165,7 +173,9 @@ def refuse_few_subjects(where: object, entries: Sequence[Entry]) -> None:
     count = len({entry.subject for entry in entries})
     if count < _FEWEST_SUBJECTS:
         raise InputError(
-            f"{where}, column 'subject'", f"{count} subjects", f"at least {_FEWEST_SUBJECTS} subjects"
+            f"{where}, column 'subject'",
+            f"the number of subjects is {count}",
+            f"a study needs at least {_FEWEST_SUBJECTS}",
         )
     members: dict[str | None, set[str]] = {}
     for entry in entries:
@@ -173,8 +183,8 @@ def refuse_few_subjects(where: object, entries: Sequence[Entry]) -> None:
     for entry in entries:
         if len(members[entry.group]) < _FEWEST_SUBJECTS:
             raise InputError(
-                _at(entry.where, "group"), f"{entry.group!r}, a group of one subject",
-                f"at least {_FEWEST_SUBJECTS} subjects in each group",
+                _at(entry.where, "group"), f"the group {entry.group!r} has one subject only",
+                f"a group needs at least {_FEWEST_SUBJECTS}",
             )  # fmt: skip
 
 
@@ -184,8 +194,8 @@ def _refuse_groups_within_a_subject(entries: Sequence[Entry]) -> None:
         first = seen.setdefault((entry.subject, entry.site), entry)
         if first.group != entry.group:
             raise InputError(
-                _at(entry.where, "group"), f"{entry.group!r} for subject {entry.subject}",
-                f"{first.group!r} as in {first.where}; a subject can be in two groups only at two sites",
+                _at(entry.where, "group"), f"it is {entry.group!r} for subject {entry.subject}, and "
+                f"{first.group!r} in {first.where}", "a subject can be in two groups only at two sites",
             )  # fmt: skip
 
 

@@ -14,25 +14,25 @@ _LARGEST_CV = 10.0  # above this coefficient of variation, a percentage says lit
 _MORE = {
     1: "stiffer than",
     -1: "more permeable than",
-}  # by the power of a stress with which a parameter scales
+}  # keys: the power of a stress with which a parameter scales
 
 
 def sentences(population: Population) -> tuple[str, ...]:
     """Returns the result in sentences: each parameter, then what the data cannot tell, then the checks."""
-    by_parameter = [text for one in population.parameters for text in _of_parameter(population, one)]
+    by_parameter = [text for summary in population.parameters for text in _of_parameter(population, summary)]
     return (*by_parameter, *_of_table(population), *_of_checks(population))
 
 
 def headline(population: Population) -> tuple[str, ...]:
     """Returns the result in two sentences at most: the clearest difference, and the widest variation."""
-    known = [one for one in population.parameters if one.informative]
+    known = [summary for summary in population.parameters if summary.informative]
     if not known:
         return ("No recording of the study informs any of these parameters.",)
     said = [] if (clearest := clearest_contrast(population)) is None else [contrast_sentence(*clearest)]
-    varying = [one for one in known if not one.between.only_upper_bound]
+    varying = [summary for summary in known if not summary.between.only_upper_bound]
     if not varying:
         return (*said, "The variation between subjects cannot be told from zero in any parameter.")
-    widest = max(varying, key=lambda one: one.between.sd.median)
+    widest = max(varying, key=lambda summary: summary.between.sd.median)
     variation = f"{widest.parameter.name} varies most: {_spread('between subjects', widest.between)}"
     if widest.within is not None:
         variation += f", and {_spread('within a subject', widest.within)}"
@@ -42,10 +42,10 @@ def headline(population: Population) -> tuple[str, ...]:
 def clearest_contrast(population: Population) -> tuple[Parameter, Contrast] | None:
     """Returns the difference of two groups or sites that is least likely to be none, with its parameter."""
     pairs = [
-        (one.parameter, contrast)
-        for one in population.parameters
-        for contrast in one.contrasts
-        if one.informative
+        (summary.parameter, contrast)
+        for summary in population.parameters
+        for contrast in summary.contrasts
+        if summary.informative
     ]
     return max(pairs, key=lambda pair: abs(pair[1].probability - 0.5)) if pairs else None
 
@@ -69,24 +69,24 @@ def percentage(cv: Estimate) -> str:
     return f"{median} % [{low}, {high} %]"
 
 
-def _of_parameter(population: Population, one: ParameterOfPopulation) -> Iterator[str]:
-    name, count = one.parameter.name, len(population.recordings)
-    if not one.informative:
+def _of_parameter(population: Population, summary: ParameterOfPopulation) -> Iterator[str]:
+    name, count = summary.parameter.name, len(population.recordings)
+    if not summary.informative:
         yield f"{name}: no recording informs it, so all its numbers are those of the prior."
         return
-    yield f"{name}: {_medians(one)}."
-    yield from (contrast_sentence(one.parameter, contrast) for contrast in one.contrasts)
-    yield f"{name}: {_spread('between subjects', one.between)}."
-    if one.within is not None:
-        yield f"{name}: {_spread('within a subject', one.within)}."
-    if one.repeats is not None:
-        yield f"{name}: {_spread('between recordings of one session', one.repeats)}."
-    if one.informative < count:
+    yield f"{name}: {_medians(summary)}."
+    yield from (contrast_sentence(summary.parameter, contrast) for contrast in summary.contrasts)
+    yield f"{name}: {_spread('between subjects', summary.between)}."
+    if summary.within is not None:
+        yield f"{name}: {_spread('within a subject', summary.within)}."
+    if summary.repeats is not None:
+        yield f"{name}: {_spread('between recordings of summary session', summary.repeats)}."
+    if summary.informative < count:
         yield (
-            f"{name}: only {one.informative} of {count} recordings inform it; the others follow the "
+            f"{name}: only {summary.informative} of {count} recordings inform it; the others follow the "
             "population."
         )
-    for side, leaning in (("lower", one.at_lower), ("upper", one.at_upper)):
+    for side, leaning in (("lower", summary.at_lower), ("upper", summary.at_upper)):
         if leaning:
             yield (
                 f"{name}: the posteriors of {leaning} of {count} recordings lean on the {side} bound of the "
@@ -94,10 +94,10 @@ def _of_parameter(population: Population, one: ParameterOfPopulation) -> Iterato
             )
 
 
-def _medians(one: ParameterOfPopulation) -> str:
+def _medians(summary: ParameterOfPopulation) -> str:
     parts = [
-        f"{_bracketed(estimate, one.parameter.unit)}{f' in group {group}' if group else ''}"
-        for group, estimate in one.medians.items()
+        f"{_bracketed(estimate, summary.parameter.unit)}{f' in group {group}' if group else ''}"
+        for group, estimate in summary.medians.items()
     ]
     return f"the median of the population is {' and '.join(parts)}"
 
@@ -133,7 +133,7 @@ def _of_table(population: Population) -> Iterator[str]:
 
 
 def _of_checks(population: Population) -> Iterator[str]:
-    poor = sum(one.poor for one in population.overlaps)
+    poor = sum(overlap.poor for overlap in population.overlaps)
     if poor:
         yield (
             f"The draws of {poor} of {len(population.overlaps)} recordings hardly overlap with their shrunk "
@@ -146,10 +146,10 @@ def doubts(population: Population) -> tuple[str, ...]:
     """Returns the reasons why the result is not to be trusted; there are none where it is trusted."""
     verdict = population.convergence.verdict
     contradicted = (
-        f"the weighted draws of {one.recording} differ from its shrunk estimate by "
-        f"{number(one.shift_sd, 2)} of its sd"
-        for one in population.overlaps
-        if one.contradicts
+        f"the weighted draws of {overlap.recording} differ from its shrunk estimate by "
+        f"{number(overlap.shift_sd, 2)} of its sd"
+        for overlap in population.overlaps
+        if overlap.contradicts
     )
     return (*contradicted, *(() if verdict.trusted else verdict.reasons[:1]))
 

@@ -23,17 +23,23 @@ def check_consistency(surrogate: ShapeSurrogate) -> None:
     space, edges_s, active = surrogate.space, surrogate.edges_s, surrogate.active
     for p in space.parameters:
         if not (np.isfinite([p.lower, p.upper]).all() and p.lower < p.upper):
-            raise InputError(f"space: {p.name}", f"{p.lower:g} to {p.upper:g}", "lower below upper")
+            raise InputError(
+                f"space: {p.name}",
+                f"it reaches from {p.lower:g} to {p.upper:g}",
+                "the lower bound must be below the upper",
+            )
     for name, array, shape in _expected_shapes(surrogate):
         if array.shape != shape:
-            raise InputError(name, f"shape {array.shape}", f"shape {shape}")
+            raise InputError(name, f"the shape is {array.shape}", f"it must be {shape}")
         if not np.isfinite(array).all():
-            raise InputError(name, "values that are not finite", "finite numbers")
+            raise InputError(name, "some values are not finite", "all must be finite numbers")
     if not np.all(np.diff(edges_s) > 0.0):
-        raise InputError("edges_s", "edges that do not increase", "increasing edges")
+        raise InputError("edges_s", "the edges do not increase", "they must increase")
     if not np.all((active >= 0) & (active < surrogate.similarity.dim)):
         raise InputError(
-            "active", f"inputs {active.tolist()}", f"indices from 0 to {surrogate.similarity.dim - 1}"
+            "active",
+            f"it contains {active.tolist()}",
+            f"its indices must be from 0 to {surrogate.similarity.dim - 1}",
         )
 
 

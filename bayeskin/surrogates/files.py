@@ -26,7 +26,7 @@ FORMAT = "bayeskin surrogate"
 # correction, since 4 only some inputs may be active, and since 5 a correction may have additional latents.
 FORMAT_VERSION = 5
 READABLE = (3, 4, 5)  # in version 3 all inputs are active
-EXPECTED = "a surrogate that bayeskin wrote"
+EXPECTED = "a surrogate in its own HDF5 form"
 LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
 
 
@@ -102,12 +102,14 @@ def load_manifest(path: Path | str) -> dict[str, Any]:
     """
     surrogate, manifest = _load(Path(path))
     if not isinstance(manifest.get("model_hash"), str):
-        raise InputError(f"{path}: manifest: model_hash", repr(manifest.get("model_hash")), "a hash")
+        raise InputError(
+            f"{path}: manifest: model_hash", f"it is {manifest.get('model_hash')!r}", "it must be a hash"
+        )
     if manifest.get("parameters") != _parameter_table(surrogate.space):
         raise InputError(
             f"{path}: manifest: parameters",
-            "other parameters than in the arrays",
-            "the same parameters and bounds",
+            "they differ from those in the arrays",
+            "parameters and bounds must be the same",
         )
     return manifest
 
@@ -128,16 +130,18 @@ def _load(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
         manifest = json.loads(handle.attrs["manifest"])
         if not isinstance(manifest, dict) or not isinstance(surrogate.provenance, dict):
             raise InputError(
-                "manifest or provenance", "JSON that is no object", "a table of names and values"
+                "manifest or provenance", "it is not a JSON object", "it must be a table of names and values"
             )
         return surrogate, manifest
 
 
 def _refuse_unfit(path: Path, handle: h5py.File) -> None:
     if handle.attrs.get("format") != FORMAT:
-        raise InputError(path, "an HDF5 file of another origin", EXPECTED)
+        raise InputError(path, "it is an HDF5 file of another origin", f"bayeskin needs {EXPECTED}")
     version = str(handle.attrs["format_version"])
     if version not in map(str, READABLE):
-        raise InputError(path, f"format version {version:.40}", f"format version {FORMAT_VERSION}")
+        raise InputError(path, f"the version of its format is {version:.40}", f"it must be {FORMAT_VERSION}")
     if storage.contents_hash(handle) != handle.attrs["arrays_sha256"]:
-        raise InputError(path, "contents that differ from their stored hash", "an unaltered file")
+        raise InputError(
+            path, "its contents differ from their stored hash", "bayeskin needs an unaltered file"
+        )

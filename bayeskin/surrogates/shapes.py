@@ -79,7 +79,9 @@ def split(force_n: Array) -> tuple[Array, Array]:
     """Returns log RMS (n,) and shape (n, m) of histories (n, m). Raises InputError if all are zero."""
     rms = np.sqrt(np.mean(force_n**2, axis=1))
     if not rms.max() > 0.0:
-        raise InputError("design: force_n", "zero force in every run", "forces that differ from zero")
+        raise InputError(
+            "design: force_n", "the force is zero in every run", "it must differ from zero in at least one"
+        )
     rms = np.maximum(rms, SMALLEST_AMPLITUDE * rms.max())
     return np.log(rms), force_n / rms[:, None]
 

@@ -22,8 +22,8 @@ from bayeskin.types import Array
 class SubspaceSettings:
     """Settings of the subspace near which the rows of a kernel lie.
 
-    least_rows : number of rows from which on a subspace is sought; with fewer rows the products cost almost
-        nothing
+    least_rows : smallest number of rows for which a subspace is sought; with fewer rows the products cost
+        almost nothing
     least_nugget : smallest nugget with which it is sought; with a smaller nugget the rows are not near a
         subspace, or rounding hides it
     spared : share of the nugget by which a variance may become larger at a training row

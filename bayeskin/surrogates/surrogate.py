@@ -97,7 +97,11 @@ class ShapeSurrogate(FreezesArrays):
 def refuse_outside(space: ParameterSpace, theta: Array) -> None:
     """Raises InputError unless every row of theta (n, d) lies in the closed box."""
     if theta.ndim != 2 or theta.shape[1] != space.dim:
-        raise InputError("theta", f"shape {theta.shape}", f"(n, {space.dim}) for {', '.join(space.names)}")
+        raise InputError(
+            "theta",
+            f"the shape is {theta.shape}",
+            f"it must be (n, {space.dim}) for {', '.join(space.names)}",
+        )
     if np.all((theta >= space.lower) & (theta <= space.upper)):
         return
     lower = space.lower - ROUNDING * np.abs(space.lower)
@@ -108,6 +112,6 @@ def refuse_outside(space: ParameterSpace, theta: Array) -> None:
         p = space.parameters[column]
         raise InputError(
             f"theta row {row}: {p.name}",
-            f"{theta[row, column]:g} {p.unit}",
-            f"{p.lower:g} to {p.upper:g}, the box that the surrogate was trained for",
+            f"it is {theta[row, column]:g} {p.unit}",
+            f"it must lie within {p.lower:g} to {p.upper:g}, the box that the surrogate was trained for",
         )

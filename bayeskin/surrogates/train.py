@@ -68,7 +68,11 @@ def train(
     space = design.space if region is None else narrowed(design.space, *region)
     focus = np.ones(len(design.theta)) if focus is None else np.asarray(focus, dtype=float)
     if focus.shape != (len(design.theta),) or not (np.all(focus >= 0.0) and np.all(np.isfinite(focus))):
-        raise InputError("focus", f"shape {focus.shape}", f"{len(design.theta)} finite weights >= 0")
+        raise InputError(
+            "focus",
+            f"the shape is {focus.shape}",
+            f"{len(design.theta)} finite weights of at least 0 are needed",
+        )
     inputs = Similarity(space).inputs(design.theta)
     active = np.arange(inputs.shape[1]) if active is None else active
     training = design.training & _near_cube(inputs, TRAINING.margin) & (focus > 0.0)
@@ -95,8 +99,11 @@ def narrowed(space: ParameterSpace, lower: Array, upper: Array) -> ParameterSpac
     """Returns the part of a space between two corners (d,) of its unit cube. Raises InputError if empty."""
     low, high = np.clip(np.asarray(lower, dtype=float), 0, 1), np.clip(np.asarray(upper, dtype=float), 0, 1)
     if low.shape != (space.dim,) or high.shape != (space.dim,) or not np.all(low < high):
-        cube = f"two corners of the {space.dim}-dimensional unit cube"
-        raise InputError("region", f"{lower} to {upper}", cube)
+        raise InputError(
+            "region",
+            f"its corners are {lower} and {upper}",
+            f"they must be two corners of the {space.dim}-dimensional unit cube, the lower first",
+        )
     corners = zip(space.parameters, space.from_unit(low), space.from_unit(high), strict=True)
     return ParameterSpace(tuple(replace(p, lower=float(a), upper=float(b)) for p, a, b in corners))
 
@@ -104,12 +111,12 @@ def narrowed(space: ParameterSpace, lower: Array, upper: Array) -> ParameterSpac
 def _refuse_unusable(design: Design, space: ParameterSpace, training: NDArray[np.bool_]) -> None:
     fewest = space.dim + 3
     if training.sum() < fewest:
-        problem = f"{training.sum()} finished training rows in the box"
-        raise InputError("design", problem, f"at least {fewest}")
+        problem = f"it has {training.sum()} finished training rows in the box"
+        raise InputError("design", problem, f"at least {fewest} are needed")
     wrong = np.flatnonzero(design.ok & ~np.isfinite(design.force_n).all(axis=1))
     if len(wrong):
         where = f"design: row {wrong[0]}"
-        raise InputError(where, "force that is not finite", "finite force in every finished run")
+        raise InputError(where, "its force is not finite", "the force of every finished run must be finite")
 
 
 def _near_cube(inputs: Array, margin: float) -> NDArray[np.bool_]:
@@ -159,7 +166,7 @@ def fit_latents(
     full, variances = all_components(shapes, weights)
     scores = (shapes - full.mean) @ full.components.T
     fits = [fit_one(inputs, amplitude - log_scale, weights)]
-    error, remainder = 0.0, float(variances.sum())  # for shapes, whose squares sum to the number of bins
+    error, remainder = 0.0, float(variances.sum())  # the squares of a shape sum to the number of bins
     usable = int(np.sum(variances > 1e-14 * remainder))
     for k in range(min(TRAINING.most_components, len(inputs) // 3, usable)):
         if remainder <= max(TRAINING.truncation_share * error, 1e-14 * shapes.shape[1]):

@@ -99,7 +99,9 @@ def correct(
     similarity = surrogate.similarity
     fewest = len(surrogate.active) + settings.fewest_beyond
     if training.sum() < fewest:
-        raise InputError("fine design", f"{training.sum()} finished training rows", f"at least {fewest}")
+        raise InputError(
+            "fine design", f"it has {training.sum()} finished training rows", f"at least {fewest} are needed"
+        )
     theta, force_n = fine.theta[training], fine.force_n[training]
     inputs, weights = surrogate.inputs(theta), focus[training]
     coarse_latents = coarse.predict(inputs)[0]

@@ -52,7 +52,7 @@ class Parameter:
 
 
 class Correlation(NamedTuple):
-    """The correlation of the normal priors of two parameters, given by their names, on their lines."""
+    """The correlation of two normal priors, or of the logarithms of log-normal ones; parameters are named."""
 
     first: str
     second: str
@@ -76,25 +76,38 @@ class ParameterSpace:
         twice = next((name for name in self.names if self.names.count(name) > 1), None)
         if twice is not None:
             raise InputError(
-                "parameters", f"{twice} twice", "different names for all parameters, also those of mechanisms"
+                "parameters",
+                f"{twice} is the name of two parameters",
+                "all need different names, also those of mechanisms",
             )
         peaked, pairs = [p.name for p in self.parameters if p.peaked], set[frozenset[str]]()
         for first, second, value in self.correlations:
             for name in (first, second):
                 if name not in peaked:
-                    found = f"{name}, whose prior is not normal" if name in self.names else repr(name)
-                    raise InputError("correlations", found, "two parameters with normal or log-normal priors")
+                    known = name in self.names
+                    problem = f"the prior of {name} is not normal" if known else f"{name!r} is not known"
+                    raise InputError(
+                        "correlations", problem, "both parameters need normal or log-normal priors"
+                    )
             if first == second or not abs(value) < 1.0:
                 where = f"correlations: {first} and {second}"
-                raise InputError(where, f"{value:g}", "two different parameters and a value between -1 and 1")
+                raise InputError(
+                    where,
+                    f"the value is {value:g}",
+                    "two different parameters and a value between -1 and 1 are needed",
+                )
             if {first, second} in pairs:
-                raise InputError(f"correlations: {first} and {second}", "two values", "one value")
+                raise InputError(f"correlations: {first} and {second}", "two values are given", "give one")
             pairs.add(frozenset((first, second)))
         if self.correlations and not np.linalg.eigvalsh(self._correlation).min() > 1e-9:
             stated = ", ".join(
                 f"{first} and {second} {value:g}" for first, second, value in self.correlations
             )
-            raise InputError("correlations", stated, "correlations that form a positive definite matrix")
+            raise InputError(
+                "correlations",
+                f"{stated} cannot be true together",
+                "the matrix of correlations must be positive definite",
+            )
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -16,7 +16,10 @@ from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
 from bayeskin.workflow.engine import Run
 from bayeskin.workflow.model import model_spec
 
-ARTICLE_HOLDS_S = ((18.8, 75.0), (97.8, 145.0))  # from the article's script; its text says 20-75 and 98-140
+ARTICLE_HOLDS_S = (
+    (18.8, 75.0),
+    (97.8, 145.0),
+)  # the article's script has these; its text says 20-75 and 98-140
 
 
 def log_posterior_of(run: Run, surrogate: Surrogate, binned: BinnedForce, motion: PadMotion) -> LogPosterior:

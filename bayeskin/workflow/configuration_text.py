@@ -12,7 +12,7 @@ from bayeskin.design import default_space
 from bayeskin.inference import NoisePriors
 from bayeskin.types import Parameter
 
-_SECONDS_A_RUN = (4, 15)  # of one full run on one core, on the default mesh
+_SECONDS_A_RUN = (4, 15)  # range of one full run on one core, on the default mesh
 _REDUCED_SECONDS_A_RUN = (0.1, 0.4)
 _SHIPPED_KNOWS = (
     "# The shipped surrogate was trained for this model, this bin width and these bounds. For another model",
@@ -44,8 +44,8 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
     ("sample", "the sampler of the posterior, and when it stops", {
         "ensembles": "number of independent ensembles of walkers",
         "walkers": "number of walkers in each ensemble",
-        "effective_samples": "sampling stops when every parameter has so many effective samples",
-        "max_steps": "sampling stops after so many steps, even if the result is not trusted",
+        "effective_samples": "sampling stops when every parameter has this number of effective samples",
+        "max_steps": "sampling stops after this number of steps, even if the result is not trusted",
     }),
     ("check", "the check of the posterior with the full model", {
         "draws": "number of posterior draws at which the full model runs; 0 for no check",

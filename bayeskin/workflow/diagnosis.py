@@ -36,7 +36,7 @@ from bayeskin.workflow.model import model_spec
 from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.reducing import reduced_file
 
-KNOWN = "pads that only open, no further and no faster than in the training of the reduced model"
+KNOWN = "the pads must only open, no further and no faster than in the training of the reduced model"
 NAME = "diagnose"
 
 
@@ -66,11 +66,17 @@ def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
     source = sources[0]
     configuration = next((file for file in sources if file.suffix == ".toml"), None)
     if configuration is not None and len(sources) > 1:
-        raise InputError(configuration, "a configuration beside other files", "[[recordings]] in it")
+        raise InputError(
+            configuration,
+            "a configuration cannot be given with other files",
+            "name the recordings in it, as [[recordings]]",
+        )
     if configuration is not None:
         if device is not None:
             raise InputError(
-                "--device", f"{device} together with a configuration", "its sections [device] and [tissue]"
+                "--device",
+                f"{device} cannot be given with a configuration",
+                "use the configuration's sections [device] and [tissue]",
             )
         return open_run(source, reporter)
     width_s = max(fitting_width_s(read_recording(file)) for file in sources)
@@ -109,8 +115,11 @@ def _shared(run: Run) -> tuple[str, ...]:
     own = [name for name, m in catalogue().items() if isinstance(m.act, Instrument) and not m.act.of_skin]
     unknown = set(run.config.fit.shared) - {"p_init", "noise", *own}
     if unknown:
-        expected = f"some of p_init, noise, {', '.join(own)}"
-        raise InputError(f"{run.config_path}: fit.shared", ", ".join(sorted(unknown)), expected)
+        raise InputError(
+            f"{run.config_path}: fit.shared",
+            f"{', '.join(sorted(unknown))} cannot be shared",
+            f"use some of p_init, noise, {', '.join(own)}",
+        )
     return run.config.fit.shared
 
 
@@ -126,7 +135,7 @@ def context_of(run: Run, source: ContextSource) -> DiagnosisContext:
             outside = protocol_outside(forward.model.trained.protocols, forward.motion)
             if outside:
                 where = run.config_path if len(forwards) == 1 else run.beside(section.file)
-                problem = f"a protocol that {source.model.name} was not trained for: {outside[0]}"
+                problem = f"{source.model.name} was not trained for this protocol ({outside[0]})"
                 raise InputError(where, problem, KNOWN)
     return context
 
@@ -172,6 +181,7 @@ STAGE = Stage(
     ("seed", "model", "parameters", "noise"),
     _work,
     _files,
+    format=2,
 )
 
 

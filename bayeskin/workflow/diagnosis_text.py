@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayeskin.report.words import faint_in_words, full_run_in_words
+from bayeskin.report.words import (
+    agreement_in_words,
+    faint_in_words,
+    full_run_in_words,
+    informed_in_words,
+)
 
 
 def in_words(answer: Mapping[str, Any]) -> str:
@@ -20,7 +25,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
         f"The model deviates from the recording in {len(answer['located'])} windows, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
     )
-    lines += [_agreement_line(recording) for recording in answer["recordings"]]
+    for recording in answer["recordings"]:
+        lines += [agreement_in_words(recording), informed_in_words(recording)]
     lines += [_fit_line(label, answer["fit"][label]) for label in ("before", "after")]
     lines.append(full_run_in_words(answer["full_model"]))
     after = answer["fit"]["after"]
@@ -33,16 +39,6 @@ def in_words(answer: Mapping[str, Any]) -> str:
         lines.append(f"gain of log-evidence by single mechanisms: {best}")
     lines.append(f"outputs in {answer['folder']}")
     return "\n".join(lines)
-
-
-def _agreement_line(recording: Mapping[str, Any]) -> str:
-    """Returns a line about the agreement of one of several recordings with the others."""
-    name, rms_n, tension = recording["name"], recording["rms_n"], recording["tension"]
-    residual = f"RMS residual {1e3 * rms_n:.1f} mN, {rms_n / recording['noise_n']:.1f} sd of its noise"
-    if tension is None:
-        return f"{name}: {residual}; it could not be fitted alone"
-    verb = "contradicts" if recording["contradicts"] else "agrees with"
-    return f"{name} {verb} the others, by {max(tension, 0.0):.1f} sd: {residual}"
 
 
 def _fit_line(label: str, fit: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bayeskin
+from bayeskin.errors import reason_of
 from bayeskin.workflow.doctor_models import Finding, cores, finding_of, findings_of_models
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ def examine(folder: Path, reporter: Reporter) -> dict[str, Any]:
     ]
     ok = all(finding.ok for finding in findings)
     lines = [
-        f"{'ok    ' if finding.ok else 'BROKEN'}  {finding.name}: {finding.found}"
-        + ("" if finding.ok else f"; expected {finding.advice}")
+        f"{'ok    ' if finding.ok else 'BROKEN'}  {finding.name}: {finding.state}"
+        + ("" if finding.ok else f"; needed: {finding.needed}")
         for finding in findings
     ]
     text = "\n".join([*lines, "all is well" if ok else "something is broken"])
@@ -123,8 +124,8 @@ def _threads() -> Finding:
 def _disk_space(folder: Path) -> Finding:
     """Returns whether the disk has enough free space for a run."""
     free = shutil.disk_usage(folder).free
-    expected = f"at least {LEAST_FREE_BYTES / 1e9:g} GB"
-    return Finding("disk space", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free", expected)
+    needed = f"at least {LEAST_FREE_BYTES / 1e9:g} GB"
+    return Finding("disk space", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free", needed)
 
 
 def _write_access(folder: Path) -> Finding:
@@ -134,6 +135,6 @@ def _write_access(folder: Path) -> Finding:
             handle.write(b"bayeskin")
     except OSError as error:
         return Finding(
-            "write access", False, f"{folder}: {error.strerror}", "a folder in which runs can be written"
+            "write access", False, f"{folder}: {reason_of(error)}", "a folder in which runs can be written"
         )
     return Finding("write access", True, str(folder))

@@ -30,12 +30,12 @@ COMPLETE = "a complete installation (reinstall bayeskin)"
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check: whether the part works, what was found, and what would correct it."""
+    """The result of one check: whether the part works, its state, and what it needs."""
 
     name: str
     ok: bool
-    found: str
-    advice: str = ""
+    state: str
+    needed: str = ""
 
 
 def finding_of(name: str, check: Callable[[], Finding]) -> Finding:

@@ -72,7 +72,11 @@ class Run:
         """Returns the path of a file that the configuration names; raises InputError where there is none."""
         path = self.config_path.resolve().parent / file
         if not path.is_file():
-            raise InputError(self.config_path, f"no file {path}", "the files that the configuration names")
+            raise InputError(
+                self.config_path,
+                f"there is no file {path}",
+                "the files that the configuration names must exist",
+            )
         return path
 
     def summary(self, stage: str) -> Mapping[str, Any]:

@@ -52,8 +52,11 @@ def choose(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
     run = opened(sources, reporter, device)
     model = run.config.model
     if not stands_for(model.spec()):
-        found = f"model.observation {model.observation!r} on {model.mesh!r}"
-        raise InputError(sources[0], found, "model.observation 'reaction' on 'bricks'")
+        raise InputError(
+            sources[0],
+            f"model.observation is {model.observation!r} on {model.mesh!r}",
+            "an experiment needs 'reaction' on 'bricks'",
+        )
     diagnosed = diagnosis.diagnose(sources, reporter, device)
     if "best_set" not in diagnosed:
         return diagnosed

@@ -77,7 +77,9 @@ def moments_of(phases: Sequence[Phase], motion: PadMotion, at_s: Sequence[float]
     end_s = float(motion.time_s[-1])
     for time_s in at_s:
         if not 0.0 <= time_s <= end_s:
-            raise InputError(f"--at {time_s:g}", f"{time_s:g} s", f"a time of the test, 0 to {end_s:g} s")
+            raise InputError(
+                f"--at {time_s:g}", "this is not a time of the test", f"use a time from 0 to {end_s:g} s"
+            )
     if at_s:
         return {time_s: _during(phases, time_s) for time_s in sorted(set(at_s))}
     first = {phase.kind: phase for phase in reversed(phases)}

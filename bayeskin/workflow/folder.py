@@ -115,12 +115,14 @@ def _refuse_foreign(stage_folder: Path) -> None:
     Such a folder has a record, or contains only hidden files that a killed attempt has left.
     """
     if stage_folder.is_symlink():
-        raise InputError(stage_folder, "a link to another place", "a folder that belongs to the run")
+        raise InputError(
+            stage_folder, "it is a link to another place", "it must be a folder that belongs to the run"
+        )
     if stage_folder.is_dir() and not (stage_folder / RECORD).is_file():
         others = sorted(p.name for p in stage_folder.iterdir() if not p.name.startswith("."))
         if others:
-            expected = "a folder that only this run uses (move these files, or give the run another name)"
-            raise InputError(stage_folder, f"other files, among them {others[0]}", expected)
+            remedy = "move these files, or give the run another name"
+            raise InputError(stage_folder, f"it contains other files, such as {others[0]}", remedy)
 
 
 @contextlib.contextmanager
@@ -139,8 +141,8 @@ def locked(run_folder: Path) -> Iterator[None]:
             holder = handle.read().strip() or "unknown"
             raise InputError(
                 run_folder,
-                f"a folder in use by another bayeskin (process {holder})",
-                "one process for each run",
+                f"another bayeskin (process {holder}) uses this folder",
+                "wait until it has ended",
             ) from None
         handle.truncate(0)
         handle.write(str(os.getpid()))

@@ -51,7 +51,7 @@ def import_recording(
     stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
     readings = read_tables(file, sheet=sheet, stated=stated)
     outs = [out] if sheet != ALL else _outs(out, [reading.table for reading in readings])
-    answers = [_answer(reading, to) for reading, to in zip(readings, outs, strict=True)]
+    answers = [_answer(reading, to, stated) for reading, to in zip(readings, outs, strict=True)]
     for reading, to in zip(readings, outs, strict=True):
         for note in reading.recording.notes:
             reporter.log(f"{shown(to.name)}: {note}" if sheet == ALL else note)
@@ -68,7 +68,11 @@ def _units(texts: Sequence[str]) -> Mapping[str, Any]:
     for text in texts:
         quantity, equals, unit = text.partition("=")
         if not equals or quantity in units:
-            raise InputError(f"--unit {text}", repr(text), "QUANTITY=UNIT, once for a quantity")
+            raise InputError(
+                f"--unit {text}",
+                f"{quantity} has another unit already" if equals else "it states no unit",
+                "write --unit QUANTITY=UNIT, once for each quantity",
+            )
         units[quantity] = stated_unit(quantity, unit)
     return units
 
@@ -83,13 +87,19 @@ def _outs(out: Path, tables: Sequence[str]) -> list[Path]:
     return [out.with_name(f"{out.stem}-{name}{out.suffix}") for name in names]
 
 
-def _answer(reading: Reading, out: Path) -> dict[str, Any]:
+def _answer(reading: Reading, out: Path, stated: Stated) -> dict[str, Any]:
     """Returns what the command says of a recording. Raises InputError where it is no recording of a test."""
     recording = reading.recording
     phases = segment(recording)
     noise = phase_noise(recording, phases)
+    units = {q: unit.text.lstrip("+-") for q, unit in stated.units.items()}
     columns = {
-        q: {"number": column.index + 1, "header": column.header, "factor_to_si": reading.factors[q]}
+        q: {
+            "number": column.index + 1,
+            "header": column.header,
+            "unit": units.get(q, column.unit),
+            "factor_to_si": reading.factors[q],
+        }
         for q, column in reading.columns.items()
     }
     text = f"{describe(replace(recording, notes=()), phases, noise)}\n\nwritten to {shown(out)}"

@@ -28,7 +28,9 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
         return ModelSpec(observation="own", forward=_beside(run, model.forward))
     if model.observation == "own" and observation is None:
         raise InputError(
-            f"--mesh {mesh}", "a mesh for a model of your own", "--observation too, to run the full model"
+            f"--mesh {mesh}",
+            "a model of your own has no mesh",
+            "give --observation too, to run the full model",
         )
     if mesh is None:
         mesh = model.mesh if model.mesh == "bricks" else str(run.beside(model.mesh))
@@ -95,5 +97,7 @@ def check_protocol(run: Run, motion: PadMotion) -> None:
         protocols = load_reduced(file).trained.protocols
         lines = [line for part in motion.parts for line in protocol_outside(protocols, part)]
         if lines:
-            found = f"'reduced' on a protocol that {file.name} was not trained for: {lines[0]}"
-            raise InputError(f"{run.config_path}: design.coarse", found, "coarse = 0, or no coarse model")
+            problem = f"{file.name} was not trained for this protocol ({lines[0]})"
+            raise InputError(
+                f"{run.config_path}: design.coarse", problem, "use coarse = 0, or no coarse model"
+            )

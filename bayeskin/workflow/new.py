@@ -53,7 +53,7 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     out = out or files[0].with_suffix(".toml")
     check_ending(out, ".toml")
     if out.exists():
-        raise InputError(f"-o {out}", "a file that exists already", "the name of a new file")
+        raise InputError(f"-o {out}", "this file exists already", "give the name of a new file")
     phases = [segment(recording) for recording in recordings]
     both = list(zip(recordings, phases, strict=True))
     described = [(*pair, phase_noise(*pair)) for pair in both]
@@ -63,7 +63,7 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     )
     geometry, single = _geometry(stated), len(files) == 1
     width_s = max(map(fitting_width_s, recordings))
-    usual = single and not geometry.sd_m and width_s == BIN_WIDTH_S  # as the shipped surrogates were trained
+    usual = single and not geometry.sd_m and width_s == BIN_WIDTH_S  # shipped surrogates need all of these
     surrogate = shipped_for(motions[0], geometry.geometry) if usual else None
     reduced = None if surrogate else _reduced_for(motions, geometry.geometry, out)
     source, section = _surrogate_source(surrogate, reduced)
@@ -93,7 +93,7 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     check_ending(out, ".toml")
     for file in (out, recording):
         if file.exists():
-            raise InputError(file, "a file that exists already", "a folder without this file")
+            raise InputError(file, "this file exists already", "use a folder without it")
     text = shipped("runs/demo.toml").read_text(encoding="utf-8")
     out.parent.mkdir(parents=True, exist_ok=True)
     recording.write_bytes(shipped("data/demo.h5").read_bytes())
@@ -105,8 +105,8 @@ def _refuse_names(references: Sequence[str]) -> None:
     """Raises InputError for the name of a file that is not UTF-8."""
     for reference in references:
         if shown(reference) != reference:
-            expected = "a name in UTF-8: rename it, or write another file by `bayeskin import`"
-            raise InputError(shown(reference), "a name that a configuration cannot contain", expected)
+            remedy = "give the file a name in UTF-8, or write another file by `bayeskin import`"
+            raise InputError(shown(reference), "a configuration cannot contain this name", remedy)
 
 
 def _geometry(stated: DeviceFile | None) -> StatedGeometry:

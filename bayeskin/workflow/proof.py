@@ -18,7 +18,7 @@ from typing import Any
 
 import bayeskin
 from bayeskin import proof, report
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, reason_of
 from bayeskin.hashing import sha256_of_file
 from bayeskin.json_files import plain
 from bayeskin.proof import seals
@@ -52,10 +52,11 @@ def prove(
     """Diagnoses the recordings without a verdict, scores all verdicts, and returns the command's answer.
 
     folder : the set, by default the shipped set; verdicts and scores are written into it
-    rediagnose : so many recordings, spread over the set, are diagnosed again in a temporary folder and
+    rediagnose : number of recordings, spread over the set, that are diagnosed again in a temporary folder and
         compared with their stored verdicts; a different verdict is a failure if the stored one is of the same
         sources
-    at_most : so many recordings without a verdict are diagnosed now; the recordings judged by then are scored
+    at_most : largest number of recordings without a verdict that are diagnosed now; the recordings that have
+        a verdict then are scored
 
     A diagnosis that fails has the verdict "failed" until a later call tries it again; the other recordings
     are diagnosed nevertheless. Each scoring is recorded. While recordings are diagnosed, the seals cannot be
@@ -65,7 +66,7 @@ def prove(
     folder = shipped(SET).parent if folder is None else folder
     index, sources = seals.read_index(folder), diagnosing_sources()
     if not index:
-        raise InputError(folder, "a set without recordings", "a set that `bayeskin conceal` made")
+        raise InputError(folder, "the set has no recordings", "use a set that `bayeskin conceal` made")
     hashes = {number: entry["recording_sha256"] for number, entry in index.items()}
     diagnosed_again = _Diagnoser(folder, hashes, reporter, diagnose).work(sources, at_most, rediagnose)
     verdicts = {
@@ -136,7 +137,11 @@ class _Diagnoser:
         """
         source, expected = seals.recording_path(self.folder, number), self.hashes[number]
         if sha256_of_file(source) != expected:
-            raise InputError(source, "other contents than the index states", f"sha256 {expected[:12]}...")
+            raise InputError(
+                source,
+                "its contents differ from those of the index",
+                f"its sha256 must be {expected[:12]}...",
+            )
         with tempfile.TemporaryDirectory(prefix="bayeskin-prove-", ignore_cleanup_errors=True) as place:
             copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
             try:
@@ -167,9 +172,9 @@ def _record_and_draw(
                 figures += report.save_figure(curves, folder / "detectability", stamp)
             return figures
     except InputError as error:
-        reporter.log(f"{error}: figure and scoring are not stored")
+        reporter.log(f"figure and scoring are not stored: {error}")
     except OSError as error:  # a set inside an installed package may be read-only
-        reporter.log(f"{folder}: {error.strerror}: figure and scoring are not stored")
+        reporter.log(f"figure and scoring are not stored: {folder}: {reason_of(error)}")
     return ()
 
 
@@ -181,7 +186,11 @@ def conceal(
     Raises InputError as `proof.conceal`, and where another process works on the set.
     """
     if count < 1 or seed < 0:
-        raise InputError("--seed, --count", f"{seed}, {count}", "a seed of at least 0, a count of at least 1")
+        raise InputError(
+            "--seed, --count",
+            f"they are {seed} and {count}",
+            "the seed must be at least 0, and the count at least 1",
+        )
     started = time.monotonic()
 
     with locked(folder):

@@ -126,8 +126,11 @@ def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
         if index not in occupied:
             where = f"{run.config_path}: fit.windows_s"
             first, last = binned.edges_s[[0, -1]]
-            expected = f"windows that contain a bin of the recording, {first:g} to {last:g} s"
-            raise InputError(where, f"[{start:g}, {end:g}]", expected)
+            raise InputError(
+                where,
+                f"the window [{start:g}, {end:g}] contains no bin of the recording",
+                f"it must lie within {first:g} to {last:g} s",
+            )
 
 
 def _files(run: Run) -> Iterable[Path]:

@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from bayeskin.workflow.folder import locked
 from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
-REFINEMENT = 1  # of the bricks of the full model that reduced models replace
+REFINEMENT = 1  # refinement of the full model that reduced models replace
 EXPECTED = "a configuration, or a file with [device] and [tissue]"
 
 
@@ -62,7 +62,7 @@ def reduce(
     finished = _finished(path, trained)
     if finished:
         return _answer(path, load_reduced(path), 0.0, "done before, unchanged")
-    folder, started = path.with_name(f"{path.stem}-training"), time.perf_counter()
+    folder, started = training_folder(path), time.perf_counter()
     executor = nullcontext(local(WORKERS)) if scheduler is None else on_scheduler(scheduler)
     training_runs = Store(folder / "runs.store", "training runs", reporter.log)
     with executor as run_all, locked(folder), training_runs as store:
@@ -74,7 +74,7 @@ def reduce(
 def _build(
     path: Path, trained: Trained, settings: BuildSettings, store: Store, run_all: Map, reporter: Reporter
 ) -> None:
-    """Builds a first base model, then one from more runs, then the whole model.
+    """Builds a first base model, then one from more runs, then the mechanisms, first from fewer runs.
 
     Each replaces the one before it in the file, so that it can be used meanwhile.
     """
@@ -84,17 +84,26 @@ def _build(
         """Reports the progress."""
         reporter.progress(what, share)
 
+    def write(model: ReducedModel, sizes: BuildSettings, message: str) -> None:
+        """Writes a model that can be used, and says so."""
+        save_reduced(path, model, _manifest(sizes))
+        reporter.log(f"{path}: {message}")
+
+    first, names = settings.first, f"all {len(trained.mechanisms)} mechanisms"
     if not path.is_file():
-        first = settings.first
         reporter.log(f"a first base model is trained with {first.base_runs} full runs")
-        save_reduced(path, base_model(trained, full, first, run_all, progress), _manifest(first))
-        reporter.log(f"{path}: the first base model can be used")
-    reporter.log(f"the base model is trained with {settings.base_runs} full runs")
-    base = base_model(trained, full, settings, run_all, progress)
-    save_reduced(path, base, _manifest(settings))
-    reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
-    complete = with_mechanisms(base, trained, full, settings, run_all, progress)
-    save_reduced(path, complete, _manifest(settings))
+        write(base_model(trained, full, first, run_all, progress), first, "the first base model can be used")
+    model = load_reduced(path)
+    if not model.trained.mechanisms:
+        reporter.log(f"the base model is trained with {settings.base_runs} full runs")
+        model = base_model(trained, full, settings, run_all, progress)
+        write(model, settings, f"the base model can be used; {names} follow")
+        reporter.log(f"{names} are trained with {first.runs} full runs each")
+        model = with_mechanisms(model, trained, full, first, run_all, progress)
+        write(model, replace(settings, runs=first.runs), "the mechanisms can be used; better ones follow")
+    reporter.log(f"{names} are trained with {settings.runs} full runs each")
+    complete = with_mechanisms(model, trained, full, settings, run_all, progress)
+    write(complete, settings, "the model is finished")
 
 
 def _manifest(settings: BuildSettings) -> dict[str, Any]:
@@ -115,7 +124,7 @@ def _geometry(source: Path | None) -> Geometry:
     if source is None:
         return Geometry()
     if not source.is_file():
-        raise InputError(source, "no such file", EXPECTED)
+        raise InputError(source, "there is no such file", f"bayeskin needs {EXPECTED}")
     if "recording" not in read_toml(source, EXPECTED):
         return load_device(source).geometry
     config = load_config(source)
@@ -130,7 +139,7 @@ def default_path(source: Path | None) -> Path:
 
 
 def _finished(path: Path, trained: Trained) -> bool:
-    """Returns whether a file already contains the whole model.
+    """Returns whether a file already contains the finished model, so that no training is left to be done.
 
     Raises InputError for a file of another device.
     """
@@ -138,8 +147,15 @@ def _finished(path: Path, trained: Trained) -> bool:
         return False
     stored = load_reduced(path)
     if stored.trained.geometry != trained.geometry:
-        raise InputError(f"-o {path}", "a reduced model of another geometry", "another file name")
-    return set(stored.trained.mechanisms) == set(trained.mechanisms)
+        raise InputError(
+            f"-o {path}", "this file has a reduced model of another geometry", "use another name"
+        )
+    return set(stored.trained.mechanisms) == set(trained.mechanisms) and not training_folder(path).exists()
+
+
+def training_folder(path: Path) -> Path:
+    """Returns the folder that keeps the training runs of a reduced model until the model is finished."""
+    return path.with_name(f"{path.stem}-training")
 
 
 def find_reduced(geometry: Geometry, beside: Sequence[Path]) -> Path | None:
@@ -162,8 +178,11 @@ def reduced_file(geometry: Geometry, beside: Sequence[Path]) -> Path:
     """Returns the file that `find_reduced` finds. Raises InputError where it finds none."""
     file = find_reduced(geometry, beside)
     if file is None:
-        expected = "a reduced model that `bayeskin reduce` makes from the device's file"
-        raise InputError("reduced model", "none for this device and tissue", expected)
+        raise InputError(
+            "reduced model",
+            "there is none for this device and tissue",
+            "make it from the device's file with `bayeskin reduce`",
+        )
     return file
 
 

@@ -93,14 +93,18 @@ class ServedModel:
         names = [*(p.name for p in self.parameters), *added]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise InputError("config: mechanisms", f"{twice[0]} twice", "parameters with different names")
+            raise InputError(
+                "config: mechanisms",
+                f"two of their parameters have the name {twice[0]}",
+                "use mechanisms with parameters of different names",
+            )
         return names
 
     def _request_of(self, config: Mapping[str, Any]) -> Asked:
         """Returns a client's config as a request. Raises InputError for a config that is wrong."""
         for key in config:
             if key not in KEYS:
-                raise InputError(f"config: {key}", "an unknown key", f"one of {', '.join(KEYS)}")
+                raise InputError(f"config: {key}", "this key is not known", f"use some of {', '.join(KEYS)}")
         motion, edges_s = self.usual.motion, self.usual.edges_s
         if "protocol" in config:
             motion = _protocol(config["protocol"])
@@ -110,7 +114,9 @@ class ServedModel:
             edges_s = _times("edges_s", config["edges_s"], motion)
         times_s = _times("times_s", config["times_s"], motion) if "times_s" in config else None
         if times_s is None and len(edges_s) < 2:
-            raise InputError("config: edges_s", f"{len(edges_s)} edges", "two or more")
+            raise InputError(
+                "config: edges_s", f"the number of edges is {len(edges_s)}", "at least two are needed"
+            )
         return Asked(motion, edges_s, times_s, _mechanisms(config.get("mechanisms", [])))
 
 
@@ -151,17 +157,19 @@ def _protocol(given: Any) -> PadMotion:
     keys = {"time_s", "displacement_m"}
     if not isinstance(given, dict) or set(given) != keys:
         raise InputError(
-            "config: protocol", f"{given!r:.60}", "a table with the lists time_s and displacement_m"
+            "config: protocol",
+            f"it is {given!r:.60}",
+            "it must be a table with the lists time_s and displacement_m",
         )
     time_s, displacement_m = (_numbers(f"protocol.{key}", given[key]) for key in ("time_s", "displacement_m"))
     if len(time_s) != len(displacement_m) or len(time_s) < 2:
-        found = f"{len(time_s)} times, {len(displacement_m)} displacements"
-        raise InputError("config: protocol", found, "two lists of equal length, at least 2")
+        problem = f"it has {len(time_s)} times and {len(displacement_m)} displacements"
+        raise InputError("config: protocol", problem, "both lists need the same length, at least 2")
     if time_s[0] != 0.0 or not np.all(np.diff(time_s) > 0):
         raise InputError(
             "config: protocol.time_s",
-            f"times that start at {time_s[0]:g} or do not increase",
-            "times that increase from 0",
+            f"the times start at {time_s[0]:g} or do not increase",
+            "they must increase from 0",
         )
     return PadMotion(time_s, displacement_m)
 
@@ -170,10 +178,17 @@ def _times(key: str, given: Any, motion: PadMotion) -> Array:
     """Returns a client's times, which increase and lie within the protocol."""
     times_s, end_s = _numbers(key, given), float(motion.time_s[-1])
     if not len(times_s) or not np.all(np.diff(times_s) > 0):
-        raise InputError(f"config: {key}", f"{len(times_s)} times that do not increase", "increasing times")
+        raise InputError(
+            f"config: {key}",
+            "the times do not increase",
+            "at least one time is needed, and times must increase",
+        )
     if times_s[0] < 0.0 or times_s[-1] > end_s * (1.0 + 1e-9):
-        found = f"{times_s[0]:g} to {times_s[-1]:g} s"
-        raise InputError(f"config: {key}", found, f"times within the protocol's 0 to {end_s:g} s")
+        raise InputError(
+            f"config: {key}",
+            f"the times reach from {times_s[0]:g} to {times_s[-1]:g} s",
+            f"they must lie within the protocol, 0 to {end_s:g} s",
+        )
     return times_s
 
 
@@ -184,7 +199,11 @@ def _numbers(key: str, given: Any) -> Array:
     )
     array = np.array(given, dtype=float) if numeric and len(given) <= MOST_TIMES else np.array([np.nan])
     if not np.isfinite(array).all():
-        raise InputError(f"config: {key}", f"{given!r:.60}", f"a list of at most {MOST_TIMES} finite numbers")
+        raise InputError(
+            f"config: {key}",
+            f"it is {given!r:.60}",
+            f"it must be a list of at most {MOST_TIMES} finite numbers",
+        )
     return array
 
 
@@ -194,8 +213,12 @@ def _mechanisms(given: Any) -> tuple[Mechanism, ...]:
         return ()
     known = catalogue()
     if not isinstance(given, list) or len({str(name) for name in given}) != len(given):
-        raise InputError("config: mechanisms", f"{given!r:.60}", "a list of names, each once")
+        raise InputError(
+            "config: mechanisms", f"it is {given!r:.60}", "it must be a list of names, each once"
+        )
     for name in given:
         if not isinstance(name, str) or name not in known:
-            raise InputError("config: mechanisms", repr(name), f"some of {', '.join(known)}")
+            raise InputError(
+                "config: mechanisms", f"{name!r} is not known", f"use some of {', '.join(known)}"
+            )
     return tuple(known[name] for name in given)

@@ -51,17 +51,22 @@ def shipped_files(run: Run) -> ShippedFiles:
     path = beside if brought else _shipped_folder() / name
     if not path.is_file():
         names = ", ".join(f"{file.stem}.h5" for file in _shipped_manifests())
-        expected = f"a file beside the configuration, or a shipped file: {names}"
-        raise InputError(f"{run.config_path}: surrogate.file", f"no file {beside}", expected)
+        raise InputError(
+            f"{run.config_path}: surrogate.file",
+            f"there is no file {beside}",
+            f"name a file beside the configuration, or a shipped one: {names}",
+        )
     fine = None if run.config.design.coarse is None else path.with_name(f"{path.stem}-fine.h5")
     files = ShippedFiles(path, path.with_name(f"{path.stem}-design.h5"), fine)
     for file in files.present[1:]:
         if not file.is_file():
             raise InputError(
-                f"{run.config_path}: surrogate.file", f"no file {file}", "the surrogate's design beside it"
+                f"{run.config_path}: surrogate.file",
+                f"there is no file {file}",
+                "the design of the surrogate must lie beside it",
             )
     for file in files.present if brought else ():
-        refuse_damaged(file, "a surrogate that bayeskin wrote, and its design")
+        refuse_damaged(file, "a surrogate and its design in its own HDF5 form")
     return files
 
 
@@ -119,35 +124,30 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
     if not isinstance(waves, list) or not all(isinstance(w, dict) and "kept_fraction" in w for w in waves):
         raise InputError(
             f"{where}: manifest: waves",
-            f"{waves!r:.60}",
-            "a description of how the points of each wave were chosen",
+            f"it is {waves!r:.60}",
+            "it must describe how the points of each wave were chosen",
         )
     if manifest.get("geometry_sha256", Geometry().hash) != model_spec(run).geometry.hash:
-        expected = (
-            "a surrogate of this configuration's [device] and [tissue], or a design without surrogate.file"
-        )
-        raise InputError(where, "a surrogate of another device or tissue", expected)
+        remedy = "use one of this configuration's [device] and [tissue], or a design without surrogate.file"
+        raise InputError(where, "it belongs to another device or tissue", remedy)
     if (design.model_hash, manifest.get("model_hash")) != (waves_model(run).hash, model_spec(run).hash):
-        raise InputError(where, "a surrogate of another model", "a surrogate of this configuration's model")
+        raise InputError(where, "it belongs to another model", "use one of this configuration's model")
     if manifest.get("motion_sha256") != motion_sha256(motion):
-        raise InputError(where, "a surrogate of another protocol", "a surrogate of this recording's protocol")
+        raise InputError(where, "it belongs to another protocol", "use one of this recording's protocol")
     if len(design.edges_s) != len(binned.edges_s) or not np.allclose(design.edges_s, binned.edges_s):
-        found = f"{len(design.edges_s) - 1} bins to {design.edges_s[-1]:g} s"
-        expected = f"the recording's {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
-        raise InputError(where, found, expected)
+        problem = f"it has {len(design.edges_s) - 1} bins to {design.edges_s[-1]:g} s"
+        remedy = f"the recording needs {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
+        raise InputError(where, problem, remedy)
     for parameter in parameter_space(run.config, run.config_path).parameters:
         box = manifest["parameters"].get(parameter.name)
         if box is None:
-            raise InputError(
-                where,
-                f"a surrogate without {parameter.name}",
-                "a surrogate with this configuration's parameters",
-            )
+            remedy = "use one with this configuration's parameters"
+            raise InputError(where, f"it has no parameter {parameter.name}", remedy)
         if parameter.lower < box["lower"] or parameter.upper > box["upper"]:
             raise InputError(
                 f"{run.config_path}: parameters.{parameter.name}",
-                f"{parameter.lower:g} to {parameter.upper:g} {parameter.unit}",
-                f"bounds within {box['lower']:g} to {box['upper']:g}, the box of surrogate.file",
+                f"it reaches from {parameter.lower:g} to {parameter.upper:g} {parameter.unit}",
+                f"it must lie within {box['lower']:g} to {box['upper']:g}, the box of surrogate.file",
             )
 
 

@@ -35,7 +35,7 @@ from bayeskin.workflow.recording import pad_motion
 from bayeskin.workflow.reducing import reduced_file
 from bayeskin.workflow.simulation_answer import simulation_answer
 
-REPORTED_EVERY_S = 0.1  # with mechanisms, because their force changes within a time step of the model
+REPORTED_EVERY_S = 0.1  # interval with mechanisms, whose force changes within a time step
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,9 @@ def _check_outputs(request: SimulationRequest) -> None:
     check_folder("--fields", request.fields)
     check_folder("--figures", request.figures)
     if request.at_s and request.figures is None:
-        raise InputError(f"--at {request.at_s[0]:g}", "no --figures", "--at together with --figures DIR")
+        raise InputError(
+            f"--at {request.at_s[0]:g}", "there is no --figures for this time", "give --figures DIR too"
+        )
 
 
 def _case(request: SimulationRequest, reporter: Reporter) -> _Case:
@@ -150,8 +152,8 @@ def _case(request: SimulationRequest, reporter: Reporter) -> _Case:
     mechanisms = _mechanisms(request.mechanisms)
     spec = model_spec(run, request.mesh, request.observation)
     if spec.forward is not None and (request.fields or request.figures or mechanisms):
-        found = f"the model {spec.forward}"
-        raise InputError("simulate", found, "no fields, figures or mechanisms with a model of your own")
+        problem = f"{spec.forward} is a model of your own, and computes only the force"
+        raise InputError("simulate", problem, "leave out fields, figures and mechanisms")
     base = parameter_space(run.config, config_path)
     added = tuple(p for mechanism in mechanisms for p in mechanism.parameters)
     values = _parameter_values(ParameterSpace((*base.parameters, *added)), spec.geometry, request.settings)
@@ -177,7 +179,9 @@ def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
     known = catalogue()
     for name in names:
         if name not in known:
-            raise InputError(f"--mechanism {name}", "an unknown mechanism", f"one of {', '.join(known)}")
+            raise InputError(
+                f"--mechanism {name}", "this mechanism is not known", f"use one of {', '.join(known)}"
+            )
     return [known[name] for name in dict.fromkeys(names)]
 
 
@@ -191,11 +195,17 @@ def _parameter_values(space: ParameterSpace, geometry: Geometry, settings: Seque
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals or name not in values:
-            raise InputError(f"--set {setting}", repr(name), f"NAME=VALUE with one of {', '.join(values)}")
+            raise InputError(
+                f"--set {setting}",
+                f"{name!r} is not known" if equals else "it states no value",
+                f"write NAME=VALUE with one of {', '.join(values)}",
+            )
         try:
             values[name] = float(text)
         except ValueError:
-            raise InputError(f"--set {setting}", repr(text), "a number in SI units") from None
+            raise InputError(
+                f"--set {setting}", f"{text!r} is not a number", "give a number in SI units"
+            ) from None
     return values
 
 
@@ -205,8 +215,7 @@ def _refuse_impossible_value(parameter: Parameter, value: float) -> None:
     least = "positive number" if positive else "number of at least 0" if parameter.in_log else "number"
     below = parameter.in_log and (value < 0.0 or (positive and value == 0.0))
     if not np.isfinite(value) or below:
-        expected = f"a finite {least}"
-        raise InputError(f"--set {parameter.name}", f"{value:g}", expected)
+        raise InputError(f"--set {parameter.name}", f"it is {value:g}", f"it must be a finite {least}")
 
 
 def _field_outputs(
@@ -219,8 +228,8 @@ def _field_outputs(
     if not (request.fields or request.figures):
         return None
     if not case.spec.formulation.has_fields:
-        found = f"model.observation {case.spec.observation!r}, whose stresses differ from those of the fields"
-        raise InputError("--fields, --figures", found, "model.observation 'reaction'")
+        described = f"the stresses of observation {case.spec.observation!r} differ from those of the fields"
+        raise InputError("--fields, --figures", described, "use observation 'reaction'")
     problem = problem_at(case.spec, case.theta)
     _refuse_other_stresses(case.mechanisms, case.solved_theta, problem)
     return FieldOutputs(problem, case.theta, case.motion, moments, request.fields, request.figures)
@@ -233,10 +242,11 @@ def _refuse_other_stresses(
     for mechanism in mechanisms:
         bind = mechanism.act.bind
         if bind is not None and bind(values, problem.sites).respond is not None:
-            expected = (
-                "no mechanism that changes the tissue's stress or flow, because fields are of the base law"
+            raise InputError(
+                "--fields, --figures",
+                f"the mechanism {mechanism.name} changes the tissue's stress or flow",
+                "leave out one of them, because fields are of the base law",
             )
-            raise InputError("--fields, --figures", f"--mechanism {mechanism.name}", expected)
 
 
 def _reduced_run(case: _Case, sources: Sequence[Path | None], on_state: OnState | None) -> Simulation:
@@ -247,8 +257,10 @@ def _reduced_run(case: _Case, sources: Sequence[Path | None], on_state: OnState 
     """
     spec = case.spec
     if not stands_for(spec) or spec.refinement != 1:
-        found = f"observation {spec.observation!r} on {spec.mesh!r}, refinement {spec.refinement}"
-        raise InputError("--reduced", found, "observation 'reaction' on 'bricks', refinement 1")
+        problem = (
+            f"the observation is {spec.observation!r} on {spec.mesh!r} with refinement {spec.refinement}"
+        )
+        raise InputError("--reduced", problem, "it must be 'reaction' on 'bricks' with refinement 1")
     model = load_reduced(reduced_file(spec.geometry, [source for source in sources if source is not None]))
     return simulate_reduced(
         model, case.motion, case.solved_theta, case.mechanisms, geometry=spec.geometry, estimate=True,

@@ -64,7 +64,7 @@ def study(path: Path, reporter: Reporter, scheduler: str | None = None) -> dict[
         posteriors, left_out = _posteriors(file, members, reporter)
         answer = {**_facts(file), **_population(file, posteriors, reporter)}
         answer["recordings"] = _rows(file, members, left_out, answer.get("recordings", []))
-        answer["left_out"] = {one.member.entry.name: one.reason for one in left_out}
+        answer["left_out"] = {member.member.entry.name: member.reason for member in left_out}
         write_json(file.folder / ANSWER, answer)
         page = _write_page(file, plain(answer))
     return plain({**answer, "folder": file.folder, "page": page, "text": _text(answer, len(members), page)})
@@ -88,7 +88,7 @@ def _posteriors(
             posteriors.append((member, individual_of(member)))
         except InputError as error:
             left_out.append(LeftOut(member, str(error)))
-    return posteriors, sorted(left_out, key=lambda one: order[one.member.entry.name])
+    return posteriors, sorted(left_out, key=lambda member: order[member.member.entry.name])
 
 
 def _facts(file: StudyFile) -> dict[str, Any]:
@@ -123,7 +123,9 @@ def _population(file: StudyFile, posteriors: Sequence[Posterior], reporter: Repo
     folder.begin(where, inputs)
     rng = np.random.default_rng([file.config.seed, 5])
     tell = partial(reporter.progress, "population")
-    population = infer_population(entries, [one for _, one in posteriors], rng, priors, settings, tell)
+    population = infer_population(
+        entries, [posterior for _, posterior in posteriors], rng, priors, settings, tell
+    )
     stamp = f"bayeskin {bayeskin.__version__}, {file.config.name}, inputs {inputs[:12]}"
     for name, figure in (
         ("population", report.figure_population(population)),
@@ -142,8 +144,8 @@ def _rows(
     estimates: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
     """Returns each row of the table, with the origin of its posterior, its report and its estimates."""
-    reasons = {one.member.entry.name: one.reason for one in left_out}
-    known = {one["name"]: one for one in estimates}
+    reasons = {member.member.entry.name: member.reason for member in left_out}
+    known = {member["name"]: member for member in estimates}
     rows = []
     for member in members:
         name, run = member.entry.name, member.run

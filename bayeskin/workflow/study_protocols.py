@@ -104,8 +104,8 @@ def _trained(file: StudyFile, name: str, first: Member, reporter: Reporter) -> t
 
 def _train(run: Run) -> Mapping[str, Any]:
     """Trains the surrogate on all runs alike, writes it with its design, and returns the stage's summary."""
-    made, fine = storage.load(run.at("design", "design.h5"), Design), fine_design(run, "design")
-    surrogate, validation = train(enough(made), run.config.surrogate.kind, run.config.seed)
+    design, fine = storage.load(run.at("design", "design.h5"), Design), fine_design(run, "design")
+    surrogate, validation = train(enough(design), run.config.surrogate.kind, run.config.seed)
     if fine is not None:
         surrogate, validation = correct(surrogate, fine)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
@@ -113,7 +113,7 @@ def _train(run: Run) -> Mapping[str, Any]:
     manifest = {**manifest_of(surrogate, validation), **origin(run, motion, records)}
     file = run.at("train", FILE)
     save_surrogate(file, surrogate, manifest)
-    for ending, runs in (("design", made), ("fine", fine)):
+    for ending, runs in (("design", design), ("fine", fine)):
         if runs is not None:  # `surrogate.file` names the surrogate, beside which its runs are looked for
             storage.save(file.with_name(f"{file.stem}-{ending}.h5"), runs)
     return {key: manifest[key] for key in ("kind", "relative_error", "error_source", "model_hash")}

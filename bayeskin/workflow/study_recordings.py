@@ -20,7 +20,7 @@ from bayeskin.workflow.page import write_page
 from bayeskin.workflow.stages import doubts_of, stages_of
 
 LAST = "sample"  # the stage with which the run of a recording ends
-MOST_DRAWS = 4000  # of a recording's posterior that are read
+MOST_DRAWS = 4000  # largest number of draws of a recording's posterior that are read
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,11 @@ def members_of(file: StudyFile, entries: Sequence[Entry]) -> list[Member]:
         members.append(Member(entry, run))
         devices.setdefault((config.device, config.tissue), config)
     if len(devices) > 1 and file.config.surrogate.file is not None:
-        expected = "one device, because surrogate.file was trained for one"
-        raise InputError(f"{file.table}, column 'device'", f"{len(devices)} different devices", expected)
+        raise InputError(
+            f"{file.table}, column 'device'",
+            f"the number of devices is {len(devices)}",
+            "it must be one, because surrogate.file was trained for one",
+        )
     for config in devices.values():
         device = {"device": config.device, "tissue": config.tissue}
         waves_model(Run(file.config.model_copy(update=device), file.path, file.folder, Silent()))
@@ -84,13 +87,17 @@ def skin_parameters(config: Config, where: object) -> ParameterSpace:
     compared = tuple(p for p in space.parameters if p.lower > 0.0 and p.name not in lengths)
     names = [parameter.name for parameter in compared]
     if not compared:
-        raise InputError(f"{where}: parameters", "none that is always positive", "a lower bound above zero")
-    for one in space.correlations:
-        if (one.first in names) != (one.second in names):
-            found = f"a correlation of {one.first} and {one.second}"
-            expected = f"correlations only among {', '.join(names)}, in which skins are compared"
-            raise InputError(f"{where}: parameters", found, expected)
-    return ParameterSpace(compared, tuple(one for one in space.correlations if one.first in names))
+        raise InputError(
+            f"{where}: parameters", "none is always positive", "at least one needs a lower bound above zero"
+        )
+    for first, second, _ in space.correlations:
+        if (first in names) != (second in names):
+            problem = f"{first} and {second} have a correlation"
+            remedy = f"only {', '.join(names)}, in which skins are compared, can have correlations among them"
+            raise InputError(f"{where}: parameters", problem, remedy)
+    return ParameterSpace(
+        compared, tuple(correlation for correlation in space.correlations if correlation.first in names)
+    )
 
 
 def make_folder(file: StudyFile, members: Sequence[Member]) -> None:

@@ -89,7 +89,9 @@ def _try_forward_model(run: Run, model: ForceModel, motion: PadMotion, space: Pa
     middle = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
     simulation = model(motion, middle)
     if simulation.status != "ok":
-        raise InputError(forward, simulation.message, f"a force at {middle}")
+        raise InputError(
+            forward, f"its trial run failed ({simulation.message})", f"it must return a force at {middle}"
+        )
 
 
 def _drawn_wave(

@@ -35,11 +35,13 @@ def main() -> None:
             needed.mkdir()
         (corpus / "sound").write_bytes(make(Path(folder)))
 
-        def one(data: bytes) -> None:
+        def read_bytes(data: bytes) -> None:
             path.write_bytes(data)
             fuzzed_files.refused(read, path)
 
-        atheris.Setup([sys.argv[0], f"-atheris_runs={count}", "-seed=1", "-max_len=65536", str(corpus)], one)
+        atheris.Setup(
+            [sys.argv[0], f"-atheris_runs={count}", "-seed=1", "-max_len=65536", str(corpus)], read_bytes
+        )
         atheris.Fuzz()
 
 

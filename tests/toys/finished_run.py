@@ -143,6 +143,7 @@ def summaries() -> dict[str, dict[str, Any]]:
         },
         "diagnose": {
             "verdict": "named",
+            "recordings": [],
             "located": [{"t0": 0.0, "t1": 9.5, "phase": "rest", "cycle": 0, "mean_residual": -0.0586,
                          "significance": 0.001}],
             "remaining": [], "smooth_probability": 0.07, "nothing_probability": 0.0,

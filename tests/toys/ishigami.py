@@ -16,6 +16,6 @@ def ishigami(x):
 
 
 def ishigami_indices():
-    one, two, both = 0.5 * (1 + 0.1 * np.pi**4 / 5) ** 2, 49 / 8, 8 * 0.01 * np.pi**8 / 225
-    whole = one + two + both
-    return np.array([one, two, 0]) / whole, np.array([one + both, two, both]) / whole
+    first, second, both = 0.5 * (1 + 0.1 * np.pi**4 / 5) ** 2, 49 / 8, 8 * 0.01 * np.pi**8 / 225
+    whole = first + second + both
+    return np.array([first, second, 0]) / whole, np.array([first + both, second, both]) / whole

@@ -57,7 +57,7 @@ def set_by_blanks() -> list[Export]:
         Export(
             "unclear_blanks.txt",
             aligned("Run time Pad displacement Pull force", NUMBERS),
-            refused="above rows of 3 cells; expected a header; or import with --time 1",
+            refused="above rows of 3 cells; write a header, or import with --time 1",
             columns=NUMBERED,
             units=UNITS,
         ),
@@ -65,17 +65,17 @@ def set_by_blanks() -> list[Export]:
         Export(
             "blank_thousands.txt",
             aligned("t_s  d_mm  Pull force_mN", preloaded),
-            refused="'t_s  d_mm  Pull force_mN' above rows of 4 cells",
+            refused="'t_s  d_mm  Pull force_mN' stands above rows of 4 cells",
         ),
         Export(
             "blank_thousands_one_blank.txt",
             aligned("t_s d_mm Pull force_mN", preloaded),
-            refused=r"row 2: found '1 3\d\d\.\d' in columns 3 and 4, maybe one number",
+            refused=r"row 2: '1 3\d\d\.\d' in columns 3 and 4 may be one number",
         ),
         Export(
             "blank_thousands_zeros.txt",
             aligned("t_s d_mm Pull force_mN", cells(T, D, fixed(1e3 * FORCE_N + 1005, 1, thousands=" "))),
-            refused=r"' .* 1 0.*' above rows of 4 cells",
+            refused=r"' .* 1 0.*' stands above rows of 4 cells",
         ),
         Export("row_number.dat", aligned("# t_ms disp_um load_mN", counted)),
     ]
@@ -118,14 +118,14 @@ def headings() -> list[Export]:
         Export(
             "no_header.csv",
             text(NUMBERS, ","),
-            refused="no names above rows of 3 cells",
+            refused="no names stand above rows of 3 cells",
             columns=NUMBERED,
             units=UNITS,
         ),
         Export(
             "two_cells.csv",
             text([cells_a_b, *cells(T, D, F, fixed(2 * FORCE_N, 5))], ","),
-            refused="'Force A .N.' and 'Force B .N.', each a force column; .*--force NAME or NUMBER",
+            refused="'Force A .N.' and 'Force B .N.' are force columns; .*--force NAME or NUMBER",
             columns={"force": "Force A (N)"},
         ),
     ]
@@ -172,21 +172,23 @@ def numbers() -> list[Export]:
         ),
         Export("three_commas.csv", text([micro, *commas], ";"), noted="a comma is the decimal sign"),
         Export(
-            "two_signs.csv", text([HEADER, *cells(T, fixed(PULLED_MM, 3, ","), F)], ";"), "one decimal sign"
+            "two_signs.csv",
+            text([HEADER, *cells(T, fixed(PULLED_MM, 3, ","), F)], ";"),
+            "use the same decimal sign",
         ),
         Export("imperial.csv", text([["Time (min)", "Crosshead (in)", "Load (lbf)"], *cells(*inches)], ",")),
         Export("small.csv", text([["Time (h)", "Travel (m)", "Load (uN)"], *cells(*small)], ",")),
         Export(
             "comma_twice.csv",
             text([HEADER, *COMMAS], ","),
-            refused="3 names above rows of 6 cells; expected a delimiter that is not the decimal sign",
+            refused="3 names stand above rows of 6 cells; the delimiter must not be the decimal sign",
         ),
         Export(
             "three_digits.csv",
             text(
                 [HEADER, *cells(fixed(TIME_S + 5, 3), fixed(PULLED_MM + 30, 3), fixed(FORCE_N + 2, 3))], ";"
             ),
-            refused="numbers such as '5.000', which may be 5.000 or 5000",
+            refused="numbers such as '5.000' may be 5.000 or 5000",
         ),
     ]
 
@@ -213,25 +215,25 @@ def statements() -> list[Export]:
         Export(
             "turned_cell.csv",
             text([HEADER, *cells(T, D, turned[1])], ","),
-            refused="one falls while the other rises; .*--unit force=-N",
+            refused="falls while the other rises; .*--unit force=-N",
             units={"force": "-N"},
         ),
         Export(
             "minutes.csv",
             text([["Time", *HEADER[1:]], *cells(fixed(TIME_S / 60, 8), D, F)], ","),
-            refused="column 'Time' without a known unit; .*import with --unit time=UNIT",
+            refused="the unit of 'Time' is not known; .*import with --unit time=UNIT",
             units={"time": "min"},
         ),
         Export("percent.csv", text([[*HEADER, "Extension (%)"], *cells(T, D, F, strain)], ",")),
         Export(
             "percent_alone.csv",
             text([["Time (s)", "Extension (%)", "Load (N)"], *cells(T, strain, F)], ","),
-            refused="'Extension .%.', whose unit is '%'; .*--displacement COLUMN",
+            refused="'Extension .%.' is in the unit '%'; .*--displacement COLUMN",
         ),
         Export(
             "percent_no_unit.csv",
             text([["Time (s)", "Extension", "Load (N)"], *cells(T, strain, F)], ","),
-            refused="'Extension' without a known unit; .*import with --unit displacement=UNIT",
+            refused="the unit of 'Extension' is not known; .*import with --unit displacement=UNIT",
         ),
     ]
 
@@ -253,7 +255,7 @@ def programs() -> list[Export]:
         Export(
             "mach1_functions.txt",
             mach1(*functions),
-            refused="the columns in 2 of the tables .*'Wait', 'Move Relative'",
+            refused="2 of its tables .*'Wait', 'Move Relative'",
             sheet="Move Relative",
             units={"displacement": "-mm"},
         ),
@@ -267,7 +269,7 @@ def programs() -> list[Export]:
         Export(
             "array.npy",
             npy(np.column_stack([TIME_S, PULLED_MM, FORCE_N])),
-            refused="no names above",
+            refused="no names stand above",
             columns=NUMBERED,
             units=UNITS,
         ),
@@ -284,14 +286,14 @@ def workbooks() -> list[Export]:
     beside: list[Sequence[str]] = [["First arm", "", "", "", "Second arm"], [*HEADER, "", *HEADER]]
     beside += [[*row, "", *row] for row in NUMBERS]
     two = {"left": NAMED, "right": NAMED}
-    of_two = "the columns in 2 of the tables .'left', 'right'.; .*--sheet all"
+    of_two = "2 of its tables 'left', 'right' .*--sheet all"
     return [
         Export("stale.xlsx", workbook({"Data": NAMED}, "A1:C90")),
         Export("stale_a1.xlsx", workbook({"Data": NAMED}, "A1")),
         Export("summary.xlsx", workbook(summary | specimen), noted="tables left out: 'Summary'"),
         Export("texts.xlsx", workbook({"Data": [HEADER, *COMMAS]}), noted="a comma is the decimal sign"),
         Export("two.xlsx", workbook(two), refused=of_two, sheet="right"),
-        Export("all.xlsx", workbook(summary | two), refused="2 of the tables", sheet="all", specimens=2),
+        Export("all.xlsx", workbook(summary | two), refused="2 of its tables", sheet="all", specimens=2),
         Export("beside.xlsx", workbook({"Data": beside}), refused="'Data Second arm'", sheet="Second arm"),
         Export(
             "beside.csv", text(beside, ";"), refused="'First arm', 'Second arm'", sheet="all", specimens=2

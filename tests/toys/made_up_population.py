@@ -71,12 +71,15 @@ def population(
 ) -> Population:
     """A result with one parameter for each of the `changes` to the stiffness (none: only the stiffness)."""
     layout = Layout.of(entries)
-    parameters = tuple(parameter(layout, **one) for one in changes or ({},))
+    parameters = tuple(parameter(layout, **changed) for changed in changes or ({},))
     rng = np.random.default_rng(0)
     recordings, overlaps = [], []
     for n, name in enumerate(layout.recordings):
         group = layout.group.of(n) if layout.group else None
-        values = [np.exp(0.3 * rng.standard_normal()) * one.medians[group or ""].median for one in parameters]
+        values = [
+            np.exp(0.3 * rng.standard_normal()) * summary.medians[group or ""].median
+            for summary in parameters
+        ]
         recordings.append(
             Shrunk(
                 name, layout.subjects[layout.subject[n]], group, tuple(about(v, 2.0) for v in values),

@@ -132,7 +132,7 @@ class Exact:
         """Mean and covariance of z."""
         blocks = [np.diag(self.model.sd.ravel() ** 2)]
         blocks += [
-            np.kron(np.eye(unit.shape[1]), one) for unit, one in zip(self._units[1:], levels, strict=True)
+            np.kron(np.eye(unit.shape[1]), level) for unit, level in zip(self._units[1:], levels, strict=True)
         ]
         mean = np.zeros(self._design.shape[1])
         mean[: self.model.centre.size] = self.model.centre.ravel()

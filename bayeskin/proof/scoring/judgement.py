@@ -20,7 +20,7 @@ from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S
 from bayeskin.proof.scoring.look_alikes import is_listed, stands_for
 from bayeskin.proof.scoring.shares import WITHIN_SD
 
-CLEAR = 3.0  # in multiples of the noise floor: effects of at least this size should be named
+CLEAR = 3.0  # noise floors; effects of at least this size should be named
 BASE = ("E_c", "E_s", "k_c", "k_s")
 SEVERAL = "several names"
 TOO_LARGE = "group too large"  # the group of look-alikes is larger than each group listed

@@ -20,7 +20,7 @@ from bayeskin.proof.scoring.curves import FEWEST, curve
 from bayeskin.proof.scoring.judgement import Judged, judge
 from bayeskin.proof.scoring.shares import median, share, share_of_parts
 
-SIZE_EDGES = (0.0, 1.0, 1.5, 2.2, 3.0, 5.0, 8.0, 15.0, np.inf)  # of size classes, in multiples of the floor
+SIZE_EDGES = (0.0, 1.0, 1.5, 2.2, 3.0, 5.0, 8.0, 15.0, np.inf)  # edges of size classes, in noise floors
 
 
 def score(keys: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -16,9 +16,11 @@ from bayeskin.report.page.parts import Chart, Key
 from bayeskin.report.page.plot import Phases, Plot, moments
 from bayeskin.report.style import parameter_colors
 from bayeskin.sensitivity.result import SobolResult
-from bayeskin.types import Array
+from bayeskin.types import Array, Recording
 
+_STRIPES = 700  # the width of a chart in stripes; a stripe shows its smallest and its largest sample
 _BANDS = Key("50 and 90 % bands", "band")
+_PHASES = tuple(Key(kind, f"phase {kind}") for kind in ("load", "hold", "unload"))
 
 
 def history_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
@@ -68,6 +70,45 @@ def residual_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
         alt,
         (Key("recorded − predicted median", "dots"), _BANDS),
     )
+
+
+def recording_charts(recording: Recording, phases: Phases) -> tuple[Chart, Chart]:
+    """Returns the charts of a recording's displacement [mm] and force [N] over time, as measured.
+
+    phases : kind, cycle, start_s and end_s of each phase
+    """
+    displacement_mm = 1e3 * recording.displacement_m
+    duration_s = recording.time_s[-1] - recording.time_s[0]
+    alt = f"over {number(duration_s, 4)} s, as measured, from {{}} to {{}} {{}}, with the phases shaded."
+    charts = []
+    for key, name, values, unit in (
+        ("displacement", "Displacement", displacement_mm, "mm"),
+        ("force", "Force", recording.force_n, "N"),
+    ):
+        shown = _extremes(recording.time_s, values)
+        time_s, values = recording.time_s[shown], values[shown]
+        plot = Plot(time_s, [values])
+        says = [
+            f"{moment}: {number(value, 4)} {unit}"
+            for moment, value in zip(moments(time_s, phases), values, strict=True)
+        ]
+        svg = plot.svg(key, f"{name.lower()} [{unit}]", phases, [plot.line(values, "median")], 1)
+        low, high = (number(float(end), 3) for end in (values.min(), values.max()))
+        title, described = f"{name} over time", f"{name} {alt.format(low, high, unit)}"
+        charts.append(Chart(key, title, svg, plot.numbers([values], says), described, _PHASES))
+    return charts[0], charts[1]
+
+
+def _extremes(time_s: Array, values: Array) -> NDArray[np.int64]:
+    """Returns which samples (k,) show a line over time: the smallest and the largest of each stripe."""
+    edges = np.linspace(time_s[0], time_s[-1], _STRIPES + 1)
+    starts = np.unique(np.searchsorted(time_s, edges[:-1]))
+    ends = [*starts[1:], len(time_s)]
+    chosen = {0, len(time_s) - 1}
+    for start, end in zip(starts, ends, strict=True):
+        stripe = values[start:end]
+        chosen |= {int(start + stripe.argmin()), int(start + stripe.argmax())}
+    return np.array(sorted(chosen), dtype=np.int64)
 
 
 def indices_chart(key: str, title: str, result: SobolResult, phases: Phases) -> Chart:

@@ -10,7 +10,7 @@ from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.parts import Block, Cell, Folded, Heading, Section, Table, Text, row
 from bayeskin.report.page.sections import absent, cell
-from bayeskin.report.words import faint_in_words, full_run_in_words
+from bayeskin.report.words import faint_in_words, full_run_in_words, informed_in_words
 
 _VERDICTS = {
     "nothing-missing": "The recording shows no physics that the model leaves out.",
@@ -27,6 +27,9 @@ def mismatch(facts: RunFacts) -> Section:
         blocks.append(Text([" ".join([_VERDICTS[diagnosis["verdict"]], *faint_in_words(diagnosis)])]))
         if diagnosis["mechanisms"]:
             blocks.append(_mechanisms(diagnosis["mechanisms"]))
+        if diagnosis["recordings"]:
+            blocks.append(_recordings(diagnosis["recordings"]))
+            blocks.append(Text([f"{informed_in_words(recording)}." for recording in diagnosis["recordings"]]))
         blocks += [_fits(diagnosis["fit"]), Text([full_run_in_words(diagnosis["full_model"])])]
         blocks += pictures(facts, "diagnose")
         if diagnosis["mechanisms"]:
@@ -58,6 +61,18 @@ def _mechanisms(named: Sequence[Mapping[str, Any]]) -> Table:
     ]
     head = ("mechanism", "effect in this recording", "probability", "changes the force by", "look-alikes")
     return Table("Mechanisms that were named", head, rows)
+
+
+def _recordings(recordings: Sequence[Mapping[str, Any]]) -> Table:
+    rows = []
+    for recording in recordings:
+        ratio, tension = recording["rms_n"] / recording["noise_n"], recording["tension"]
+        distance = "not known" if tension is None else Cell(number(max(tension, 0.0)), tension)
+        result = "contradicts them" if recording["contradicts"] else "agrees with them"
+        size = cell(recording["rms_n"], "N")
+        rows.append(row((recording["name"], size, Cell(number(ratio), ratio), distance, result)))
+    head = ("recording", "RMS residual", "in sd of its noise", "distance from the others [sd]", "result")
+    return Table("Each recording beside the others", head, rows)
 
 
 def _parameters(named: Sequence[Mapping[str, Any]]) -> Table:

@@ -18,7 +18,7 @@
     const rows = [...body.rows].sort((a, b) => compare(order(a, column), order(b, column)));
     body.append(...(down ? rows.reverse() : rows));
   };
-  each("table", (table) => {
+  each("table:not(.unsorted)", (table) => {
     if (table.tBodies[0].rows.length < 2) return;
     table.querySelectorAll("thead th").forEach((heading, column) => {
       const button = document.createElement("button");

@@ -87,7 +87,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Key:
-    """Holds an entry of a chart's legend; `mark` is "dots", "line", "dashed" or "band"."""
+    """Holds an entry of a chart's legend; `mark` is "dots", "line", "dashed", "band" or a "phase"."""
 
     text: str
     mark: str
@@ -158,8 +158,8 @@ class Verdict:
 class Answer:
     """Holds the answers to a reader's first questions: parameters, trust in them, and missing physics."""
 
-    made: Sequence[ParameterSummary]
-    made_of: Verdict
+    parameters: Sequence[ParameterSummary]
+    material: Verdict
     sure: Verdict
     missing: Verdict
 

@@ -40,19 +40,36 @@ def render_study(facts: StudyFacts) -> str:
     )  # fmt: skip
 
 
-def _rendered(template: str, **parts: Any) -> str:
-    """Returns a template filled with parts of a page."""
+def page_environment(*folders: Path) -> Environment:
+    """Returns an environment with the templates of pages, and with those of further folders before them.
+
+    Everything that a template prints is escaped.
+    """
     environment = Environment(
-        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
+        loader=FileSystemLoader([*folders, _HERE]), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters |= {"kind": _kind, "prose": prose}
-    script = (_HERE / "page.js").read_text(encoding="utf-8")
-    return environment.get_template(template).render(
-        **parts,
-        style=Markup((_HERE / "page.css").read_text(encoding="utf-8")),
-        script=Markup(script),
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+    return environment
+
+
+def page_asset(name: str) -> str:
+    """Returns the style ("page.css") or the script ("page.js") of pages."""
+    return (_HERE / name).read_text(encoding="utf-8")
+
+
+def _rendered(template: str, **parts: Any) -> str:
+    """Returns a template filled with parts of a page."""
+    script = page_asset("page.js")
+    return (
+        page_environment()
+        .get_template(template)
+        .render(
+            **parts,
+            style=Markup(page_asset("page.css")),
+            script=Markup(script),
+            script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        )
     )
 
 

@@ -100,10 +100,10 @@ def study_picture(facts: StudyFacts, name: str) -> list[Picture]:
 
 def study_sections(facts: StudyFacts) -> list[Section]:
     """Returns the sections below the answer."""
-    made = [_recordings(facts), _provenance(facts)]
+    always = [_recordings(facts), _provenance(facts)]
     if not facts.parameters:
-        return made
-    return [_groups(facts), _variation(facts), _in_words(facts), *made]
+        return always
+    return [_groups(facts), _variation(facts), _in_words(facts), *always]
 
 
 def _groups(facts: StudyFacts) -> Section:
@@ -111,8 +111,14 @@ def _groups(facts: StudyFacts) -> Section:
     groups = list(next(iter(facts.parameters.values()))["medians"])
     head = ("parameter", "meaning", *(group or "median" for group in groups))
     rows = [
-        row((name, one["meaning"], *(_estimate(one["medians"][group], one["unit"]) for group in groups)))
-        for name, one in facts.parameters.items()
+        row(
+            (
+                name,
+                parameter["meaning"],
+                *(_estimate(parameter["medians"][group], parameter["unit"]) for group in groups),
+            )
+        )
+        for name, parameter in facts.parameters.items()
     ]
     title = "Medians of the groups" if len(groups) > 1 else "Medians of the population"
     blocks: list[Block] = [Table(f"{title}, with 90 % intervals", head, rows, symbols=True)]
@@ -121,8 +127,8 @@ def _groups(facts: StudyFacts) -> Section:
             name, f"{ratio['numerator']} / {ratio['denominator']}", _estimate(ratio, ""),
             Cell(probability(ratio["probability_above_1"]), ratio["probability_above_1"]),
         ))
-        for name, one in facts.parameters.items()
-        for ratio in one["ratios"]
+        for name, parameter in facts.parameters.items()
+        for ratio in parameter["ratios"]
     ]  # fmt: skip
     if ratios:
         head = ("parameter", "ratio of the medians of", "ratio [90 %]", "probability of a ratio above 1")
@@ -135,11 +141,11 @@ def _variation(facts: StudyFacts) -> Section:
     known = {
         key: title
         for key, title in _SPREADS.items()
-        if any(one[key] is not None for one in facts.parameters.values())
+        if any(parameter[key] is not None for parameter in facts.parameters.values())
     }
     rows = [
-        row((name, *(_variation_cell(one[key]) for key in known), *_informing(facts, one)))
-        for name, one in facts.parameters.items()
+        row((name, *(_variation_cell(parameter[key]) for key in known), *_informing(facts, parameter)))
+        for name, parameter in facts.parameters.items()
     ]
     head = ("parameter", *known.values(), "recordings that inform it", "posteriors that lean on a bound")
     caption = "Coefficients of variation, with 90 % intervals; the second is the repeatability"
@@ -148,8 +154,8 @@ def _variation(facts: StudyFacts) -> Section:
     return Section("variation", "Variation", [Table(caption, head, rows, symbols=True)])
 
 
-def _informing(facts: StudyFacts, one: Mapping[str, Any]) -> tuple[Cell, Cell]:
-    count, leaning = one["informative_recordings"], one["leaning_on_bounds"]
+def _informing(facts: StudyFacts, parameter: Mapping[str, Any]) -> tuple[Cell, Cell]:
+    count, leaning = parameter["informative_recordings"], parameter["leaning_on_bounds"]
     total = len(facts.answer["recordings"]) - len(facts.answer["left_out"])
     sides = [f"{leaning[side]} on the {side}" for side in ("lower", "upper") if leaning[side]]
     return (
@@ -176,19 +182,21 @@ def _in_words(facts: StudyFacts) -> Section:
 def _recordings(facts: StudyFacts) -> Section:
     """Returns the section on the recordings, whose names open their reports."""
     rows = facts.answer["recordings"]
-    columns = [key for key in ("subject", "group", "site", "session") if any(one[key] for one in rows)]
+    columns = [
+        key for key in ("subject", "group", "site", "session") if any(recording[key] for recording in rows)
+    ]
     head = ("recording", *columns, "posterior", *facts.parameters)
     table = Table(
         "Recordings. A name opens the recording's own report; values are given the whole study",
         head,
         [
             (
-                Cell(one["name"], href=one["report"] or ""),
-                *(Cell(str(one[key])) for key in columns),
-                Cell("trusted" if one["left_out"] is None else "left out"),
-                *_values(one, facts.parameters),
+                Cell(recording["name"], href=recording["report"] or ""),
+                *(Cell(str(recording[key])) for key in columns),
+                Cell("trusted" if recording["left_out"] is None else "left out"),
+                *_values(recording, facts.parameters),
             )
-            for one in rows
+            for recording in rows
         ],
     )
     blocks: list[Block] = [*study_picture(facts, "recordings"), table]
@@ -199,28 +207,35 @@ def _recordings(facts: StudyFacts) -> Section:
     return Section("recordings", "Recordings", blocks)
 
 
-def _values(one: Mapping[str, Any], parameters: Mapping[str, Any]) -> Sequence[Cell]:
-    given = one.get("given_the_study")
+def _values(recording: Mapping[str, Any], parameters: Mapping[str, Any]) -> Sequence[Cell]:
+    given = recording.get("given_the_study")
     if given is None:
         return [Cell("–")] * len(parameters)
     return [_estimate(given[name], parameter["unit"]) for name, parameter in parameters.items()]
 
 
-def _estimate(one: Mapping[str, float], unit: str) -> Cell:
+def _estimate(estimate: Mapping[str, float], unit: str) -> Cell:
     """Returns a median with its 90 % interval."""
-    return Cell(with_interval(one["median"], one["low_90"], one["high_90"], unit), one["median"])
+    return Cell(
+        with_interval(estimate["median"], estimate["low_90"], estimate["high_90"], unit), estimate["median"]
+    )
 
 
 def _provenance(facts: StudyFacts) -> Section:
     """Returns the section on provenance: version, files, hashes and seed."""
     answer = facts.answer
-    models = sorted({one["model_hash"] for one in answer["recordings"] if one["model_hash"]})
+    models = sorted(
+        {recording["model_hash"] for recording in answer["recordings"] if recording["model_hash"]}
+    )
     pairs = [
         ("bayeskin", facts.version), ("study", facts.config_path),
         ("sha256 of its settings", answer["config_sha256"]), ("sha256 of its table", answer["table_sha256"]),
         ("hashes of the models", ", ".join(models) or "–"), ("seed", str(answer["seed"])),
     ]  # fmt: skip
-    hashes = [row((one["name"], one["recording"], str(one["sha256"] or "–"))) for one in answer["recordings"]]
+    hashes = [
+        row((recording["name"], recording["recording"], str(recording["sha256"] or "–")))
+        for recording in answer["recordings"]
+    ]
     return Section(
         "provenance", "Provenance",
         [

@@ -1,0 +1,5 @@
+"""Runs the command line as `python -m bayeskin`."""
+
+from bayeskin.cli import main
+
+main()
