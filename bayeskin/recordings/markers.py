@@ -52,6 +52,7 @@ def read_markers(path: Path | str, recording: Recording, start_s: float = 0.0) -
     The file is a table with the columns time (s), point, x and y (mm), or a file that bayeskin wrote.
 
     start_s : time in a table that is zero in the recording
+
     Raises InputError for a file that is no such table, and for tracks that do not belong to the recording.
     """
     path = Path(path)
