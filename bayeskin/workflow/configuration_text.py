@@ -20,7 +20,10 @@ _SHIPPED_KNOWS = (
 )
 
 _NOISE = NoisePriors()
-_EXAMPLES = {"windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu}
+_EXAMPLES = {
+    "windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu,
+    "marker_sd_m": _NOISE.marker_sd_m,
+}  # fmt: skip
 # Each entry has the name of a section, its subject, and its keys with their meaning.
 _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
     ("model", "the force that the model reports, and the mesh", {
@@ -36,6 +39,7 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
         "sd_n": "standard deviation, in N, of each kind of phase",
         "tau_s": "correlation time, in s",
         "nu": "degrees of freedom of the Student-t noise; small values mean heavy tails",
+        "marker_sd_m": "standard deviation, in m, of the displacements of markers, if there are any",
     }),
     ("map", "the search for the most probable point", {
         "starts": "number of starting points; three kinds of search take turns",
