@@ -144,6 +144,7 @@ def drawn_fields(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return given
 
 
+@pytest.mark.slow
 def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
     bayeskin: Command, measured: Path, tmp_path: Path, runs: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -65,6 +65,7 @@ def test_a_worker_killed_in_mid_run_costs_its_own_point_which_is_run_again(
     assert_same_rows(design, expected)
 
 
+@pytest.mark.slow
 def test_a_point_that_kills_every_worker_is_a_failed_row(cluster, tmp_path: Path) -> None:
     simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=99)
     with on_scheduler(cluster.scheduler_address) as over:

@@ -96,6 +96,7 @@ def test_a_law_bound_to_some_points_is_that_of_all_at_these(name):
     np.testing.assert_array_equal(some.par, LAWS[name].par)
 
 
+@pytest.mark.slow
 def test_compiled_code_calls_the_kernels_of_any_laws_by_their_address():
     @numba.njit
     def one_after_the_other(kernels, par, data, f, p, g, before, after, stress, content, flux):

@@ -206,6 +206,7 @@ def test_leakage_of_a_uniform_pressure_is_conductance_times_the_open_area(proble
     assert not set(open_surface(problem)) & set(problem.mesh.facets["pad"])
 
 
+@pytest.mark.slow
 def test_pre_stretched_skin_pulls_as_skin_that_was_pulled_slowly_before():
     """The force of drained skin follows the displacement alone, so that F(u) = G(u + d) - G(d)."""
     theta = THETA | {"k_c": 1e-11, "k_s": 1e-11}

@@ -241,6 +241,7 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
         assert (low < truth < high) == inside, (low, truth, high)
 
 
+@pytest.mark.slow
 def test_draws_are_the_same_however_often_it_is_asked_whether_they_do() -> None:
     alone = concealing(0)
     base = fitted(alone)

@@ -229,6 +229,7 @@ def key(task: Task) -> str:
     return json.dumps([type(task).__name__, asdict(task)], default=np.ndarray.tolist)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_search(asked: Make, searched: Searched) -> None:
     first, result = searched()
     second, other = asked(), asked()
@@ -249,7 +250,7 @@ def of_the_drift(task: Task) -> bool:
     ("lost", "reached"),
     [
         (lambda task: isinstance(task, ScoreTestTask), {"stiffness-drift"}),
-        (of_the_drift, {"force-offset", "sensor-drift"}),
+        pytest.param(of_the_drift, {"force-offset", "sensor-drift"}, marks=pytest.mark.slow),
         (lambda task: isinstance(task, FitTask | FitWithAddedTask) and bool(names_of(task)), set()),
     ],
     ids=["promises", "probes of a mechanism", "fits with mechanisms"],

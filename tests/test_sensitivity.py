@@ -119,7 +119,7 @@ def by_salib():
     return surrogate, dict(zip(bins, rows, strict=True))
 
 
-@pytest.mark.parametrize("method", ["pick-freeze", "projection"])
+@pytest.mark.parametrize("method", [pytest.param("pick-freeze", marks=pytest.mark.slow), "projection"])
 def test_indices_of_the_shipped_surrogate_agree_with_salib(by_salib, method):
     """First, total and second order, within what SALib says of its own error.
 

@@ -149,6 +149,7 @@ def test_a_finished_study_repeats_nothing(
     assert "population: done before, unchanged" in heard.messages
 
 
+@pytest.mark.slow
 def test_another_group_in_the_table_needs_a_new_population_only(
     finished: Path, tmp_path: Path, quickly: pytest.MonkeyPatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,6 +198,7 @@ def test_a_recording_is_left_out_with_one_line(
     assert study_recordings.infer(SimpleNamespace(config=None)) == Outcome(not says, says)
 
 
+@pytest.mark.slow
 def test_a_recording_of_another_protocol_has_a_design_of_its_own(
     finished: Path, tmp_path: Path, quickly: pytest.MonkeyPatch
 ) -> None:
