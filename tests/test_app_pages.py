@@ -1,4 +1,4 @@
-"""What the page says beside the reports: comparisons of runs, the steps of a job, and the time left."""
+"""The page says more than the reports do: comparisons of runs, the steps of a job, and the time left."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from toys.app_page import DEVICE, Visitor, served, until
 from toys.external_models import PARAMETERS, SPRING
 from toys.finished_run import facts
-from toys.small_study import record
+from toys.small_study import SPRING_RUN, record
 
 from bayeskin.app import jobs
 from bayeskin.app.comparison import RunAnswer, by_parameter, run_answer, table
@@ -30,28 +30,7 @@ from bayeskin.workflow.folder import Record, write_record
 from bayeskin.workflow.stages import stages_of
 
 REDUCED, NEW = shipped("surrogates/article-device-reduced.h5"), "device-reduced.h5"
-CONFIG = """
-[recording]
-file = "a.h5"
-[model]
-forward = "spring.py:force"
-[fit]
-bin_width_s = 1.0
-[design]
-points = [24, 8]
-held_out = 6
-workers = 1
-[sample]
-ensembles = 2
-walkers = 20
-effective_samples = 100
-max_steps = 500
-[check]
-draws = 0
-[map]
-starts = 2
-evaluations = 500
-"""
+CONFIG = f'[recording]\nfile = "a.h5"\n{SPRING_RUN.format(workers=1)}'
 
 
 def test_runs_are_compared_parameter_by_parameter() -> None:

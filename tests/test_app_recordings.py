@@ -1,4 +1,4 @@
-"""What the page does with a dropped file: names, limits, columns and units, the device, and the archive."""
+"""The page takes a dropped file: names, limits, columns and units, the device, and the archive."""
 
 from __future__ import annotations
 

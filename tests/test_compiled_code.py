@@ -1,4 +1,4 @@
-"""Where numba keeps compiled code if neither the package nor the user's home can be written."""
+"""Numba keeps compiled code elsewhere if neither the package nor the user's home can be written."""
 
 from __future__ import annotations
 

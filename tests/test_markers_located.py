@@ -1,4 +1,4 @@
-"""Where on the skin markers move otherwise than a fit says, and the surrogate of their displacements."""
+"""Markers that move otherwise than a fit says are located on the skin; a surrogate of their displacements."""
 
 from __future__ import annotations
 

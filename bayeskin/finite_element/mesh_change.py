@@ -1,4 +1,4 @@
-"""By how much a finer mesh changes the displacements of markers.
+"""Computes the change of the displacements of markers from a coarse mesh to the usual one.
 
 Near the clamped edges of the pads a mesh is too stiff, so the skin between the pads moves too far. From mesh
 to mesh this error shrinks by a nearly constant factor, and it hardly depends on the skin (docs/markers.md).

@@ -54,7 +54,7 @@ def import_recording(
 
     Raises InputError, with nothing written, for a file that is no recording of a test or is not clear.
     """
-    stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
+    stated = _stated(columns, units, zero)
     imported = _read(file, out, sheet, stated, markers)
     _write(imported, reporter, named=sheet == ALL)
     return _answer(imported) if sheet == ALL else plain({"ok": True, **imported[0].answer})
@@ -76,7 +76,7 @@ def import_recordings(
     for file, to in zip(files, outs, strict=True):
         if outs.count(to) > 1:
             raise InputError(file, f"several files would become {to.name}", "import one of them alone")
-    stated = Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
+    stated = _stated(columns, units, zero)
     imported = [
         item for file, to in zip(files, outs, strict=True) for item in _read(file, to, sheet, stated, None)
     ]
@@ -153,6 +153,11 @@ def _facts_of_markers(markers: Markers, out: Path, text: str) -> dict[str, Any]:
         f"{number(markers.time_s[-1], 5)} s\nwritten to {facts['out']}"
     )
     return {"markers": facts, "text": f"{text}\n\n{sentence}"}
+
+
+def _stated(columns: Mapping[str, str | None], units: Sequence[str], zero: bool | None) -> Stated:
+    """Returns what the user states of a file. Raises InputError for a unit that is not QUANTITY=UNIT."""
+    return Stated({q: name for q, name in columns.items() if name is not None}, _units(units), zero)
 
 
 def _units(texts: Sequence[str]) -> Mapping[str, Any]:

@@ -85,10 +85,11 @@ def _build(
         reporter.progress(what, share)
 
     def write(model: ReducedModel, sizes: BuildSettings, message: str) -> None:
-        """Writes a model that can be used, and says so."""
+        """Writes a model that can be used, and says so, with the seconds since the command started."""
         save_reduced(path, model, _manifest(sizes))
-        reporter.log(f"{path}: {message}")
+        reporter.log(f"{path}: {message} ({time.perf_counter() - started:.0f} s)")
 
+    started = time.perf_counter()
     first, names = settings.first, f"all {len(trained.mechanisms)} mechanisms"
     if not path.is_file():
         reporter.log(f"a first base model is trained with {first.base_runs} full runs")

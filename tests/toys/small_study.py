@@ -19,8 +19,7 @@ from bayeskin.workflow.engine import Run, run_stages
 from bayeskin.workflow.stages import stages_of
 from bayeskin.workflow.study_recordings import Outcome
 
-STUDY = """
-table = "table.csv"
+SPRING_RUN = """
 [model]
 forward = "spring.py:force"
 [fit]
@@ -40,6 +39,7 @@ draws = 0
 starts = 2
 evaluations = 500
 """
+STUDY = f'table = "table.csv"\n{SPRING_RUN}'
 FACTOR = 2.0  # of the stiffnesses of the second group over those of the first
 ROWS = (
     ("a-1", "anna", "control", 90.0), ("a-2", "anna", "control", 95.0), ("b-1", "bela", "control", 110.0),
