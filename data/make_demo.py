@@ -2,9 +2,10 @@
 
 Run from the repository's root: ``python data/make_demo.py``. What it draws is stated in data/README.md.
 
-The slide that carries the pads has dry friction. Its law is not the one that `bayeskin diagnose` knows: a
-Coulomb slider behind a linear spring (Jenkins 1962), whose force grows linearly with the travel and then stays
-at the limit. The catalogue's law (Dahl) approaches the limit exponentially.
+The slide that carries the pads has dry friction. Its law is not the one that `bayeskin diagnose` knows, where
+friction approaches its limit exponentially (Dahl). It is a Coulomb slider behind a linear spring: friction
+grows linearly with the travel, and then stays at its limit.
+Source: W. Iwan, A distributed-element model for hysteresis, J. Appl. Mech. 33 (1966), 893-900.
 """
 
 from __future__ import annotations

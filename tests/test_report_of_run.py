@@ -10,7 +10,7 @@ from toys.finished_run import HISTORY, drawing, summaries
 
 from bayeskin.report.page.figures import FIGURES
 from bayeskin.workflow import folder, page, stages
-from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage
+from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage, open_run, run_stages
 
 CONFIG = 'seed = {seed}\n[recording]\nfile = "r.csv"\n'
 
@@ -54,6 +54,21 @@ def test_a_run_ends_with_its_page_and_report_makes_it_again(tmp_path: Path) -> N
     again = stages.report(config, Silent(), stubs())
     assert (again["ok"], again["page"]) == (True, str(path))
     assert path.read_bytes() == first
+
+
+def test_the_report_of_a_diagnosed_run_ends_with_where_what_and_how_much(tmp_path: Path) -> None:
+    config = configured(tmp_path)
+    assert "This was missing" not in stages.run(config, None, Silent(), stubs())["text"]
+    run_stages(open_run(config, Silent()), stubs(), "diagnose")
+    said = stages.report(config, Silent(), stubs())
+    assert said["text"].splitlines()[-4:] == [
+        "Recording and model differ in 1 window: rest. They differ most in the rest, from 0 to 9.5 s, where "
+        "the recording lies 58.6 mN below the model on average.",
+        "This was missing: device-friction (probability 0.98): The slide rubs: 60 mN.",
+        "The RMSE is 80 mN without and 24.7 mN with device-friction, and the 90 % band holds 90 % of the "
+        "recording without and 90 % with.",
+        f"report: {said['page']}",
+    ]
 
 
 def test_report_runs_nothing_and_names_what_is_missing(tmp_path: Path) -> None:

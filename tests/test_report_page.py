@@ -73,7 +73,9 @@ def test_the_answer_comes_first_and_says_what_how_sure_and_what_is_missing(whole
     text = Walk(whole).text()
     for said in (
         "What is this skin made of?", "50.8 kPa", "13.9 to 87 kPa", "informed, at the prior's lower bound",
-        "How sure is that? trusted", "What is missing? named", "The slide rubs: 60 mN. (probability 0.98)",
+        "How sure is that? trusted", "What is missing? named",
+        "device-friction (probability 0.98): The slide rubs: 60 mN.",
+        "Recording and model differ in 1 window: rest.",
         "Probability of a smooth effect that is not in the catalogue: 0.07.",
         "The RMSE is 80 mN without and 24.7 mN with", "form a ridge",
     ):  # fmt: skip

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayeskin.inference.identify import Informed, grade_of
-from bayeskin.number_format import interval, number, quantity
+from bayeskin.number_format import interval, number, percent, quantity
 
 ADDS = 1.2  # a recording adds something where an interval would be wider by this factor without it
 
@@ -36,6 +36,59 @@ def faint_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
         f"The model fits better with {better}, but too little or too uncertainly to name it. The skin's "
         "parameters depend on whether it acts, so do not rely on them."
     ]
+
+
+def where_in_words(diagnosis: Mapping[str, Any]) -> str:
+    """Returns where recording and model differ: the windows' phases, and the window that differs most."""
+    windows = diagnosis["located"]
+    if not windows:
+        return "Recording and model differ nowhere by more than is allowed."
+    phases = list(dict.fromkeys(_phase_in_words(window) for window in windows))
+    worst = max(windows, key=lambda window: abs(window["mean_residual"]))
+    side = "above" if worst["mean_residual"] > 0.0 else "below"
+    count = len(windows)
+    return (
+        f"Recording and model differ in {count} window{'s' * (count != 1)}: {', '.join(phases)}. They differ "
+        f"most in the {_phase_in_words(worst)}, from {number(worst['t0'])} to {number(worst['t1'])} s, where "
+        f"the recording lies {quantity(abs(worst['mean_residual']), 'N')} {side} the model on average."
+    )
+
+
+def _phase_in_words(window: Mapping[str, Any]) -> str:
+    """Returns the phase and the cycle of a window, and the recording where there are several."""
+    before_first = "" if window["cycle"] == 0 else f" of cycle {window['cycle']}"
+    recording = f" in {window['recording']}" if "recording" in window else ""
+    return f"{window['phase']}{before_first}{recording}"
+
+
+def named_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
+    """Returns each mechanism that was named, with its probability and its statement."""
+    return [
+        f"{mechanism['name']} (probability {mechanism['probability']:.2f}): {mechanism['statement']}"
+        for mechanism in diagnosis["mechanisms"]
+    ]
+
+
+def better_fit_in_words(diagnosis: Mapping[str, Any]) -> str:
+    """Returns how well the model fits without and with the best set of mechanisms."""
+    before, after = (diagnosis["fit"][when] for when in ("before", "after"))
+    if not diagnosis["best_set"]:
+        return f"The RMSE of the model is {quantity(before['rmse'], 'N')}."
+    return (
+        f"The RMSE is {quantity(before['rmse'], 'N')} without and {quantity(after['rmse'], 'N')} with "
+        f"{', '.join(diagnosis['best_set'])}, and the 90 % band holds {percent(before['coverage90'])} of the "
+        f"recording without and {percent(after['coverage90'])} with."
+    )
+
+
+def diagnosis_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
+    """Returns where recording and model differ, what was missing, and how much better the fit is."""
+    missing = {
+        "nothing-missing": "Nothing that could be named is missing.",
+        "unknown": "Something is missing that could not be named.",
+        "named": f"This was missing: {' '.join(named_in_words(diagnosis))}",
+    }[diagnosis["verdict"]]
+    return [where_in_words(diagnosis), missing, better_fit_in_words(diagnosis)]
 
 
 def full_run_in_words(full: Mapping[str, Any]) -> str:

@@ -10,14 +10,14 @@ from bayeskin.report.words import (
     faint_in_words,
     full_run_in_words,
     informed_in_words,
+    named_in_words,
 )
 
 
 def in_words(answer: Mapping[str, Any]) -> str:
     """Returns the answer as text."""
     lines = [f"verdict: {answer['verdict']}"]
-    lines += [f"  {mechanism['name']} (probability {mechanism['probability']:.2f}): {mechanism['statement']}"
-              for mechanism in answer["mechanisms"]]  # fmt: skip
+    lines += [f"  {named}" for named in named_in_words(answer)]
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
     lines.append(f"  an unnamed smooth discrepancy: probability {answer['smooth_probability']:.2f}")
     lines += [f"  {faint}" for faint in faint_in_words(answer)]

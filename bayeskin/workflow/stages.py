@@ -9,7 +9,7 @@ from typing import Any
 from bayeskin.config import Config
 from bayeskin.json_files import plain, write_json
 from bayeskin.number_format import at_edge
-from bayeskin.report.words import polished_in_words, prior_in_words
+from bayeskin.report.words import diagnosis_in_words, polished_in_words, prior_in_words
 from bayeskin.workflow import design, diagnosis, indices, maximum, posterior, recording, training
 from bayeskin.workflow.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.workflow.executor import with_scheduler
@@ -118,7 +118,8 @@ def run(
     }
     if last in (None, "report"):
         document["page"] = write_page(opened, stages)
-        text += f"\nreport: {document['page']}"
+        lines = [*_diagnosis_lines(opened, stages), f"report: {document['page']}"]
+        text = "\n".join([text, *lines])
     return plain({**document, "text": text})
 
 
@@ -147,6 +148,12 @@ def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None 
     failed = any(states[name] == "failed" for name in missing)
     document = {"ok": not failed, "stage": "report", "verdict": "not finished", "missing": missing}
     return plain({**document, "folder": opened.folder, "page": page, "text": text})
+
+
+def _diagnosis_lines(run: Run, stages: Mapping[str, Stage]) -> list[str]:
+    """Returns the diagnosis of a run in sentences; there are none where it is not done."""
+    state, record = standing(run, stages)[diagnosis.NAME]
+    return diagnosis_in_words(record.summary) if state == "done" and record is not None else []
 
 
 def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str:

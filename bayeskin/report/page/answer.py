@@ -13,7 +13,13 @@ from bayeskin.inference.identify import Informed
 from bayeskin.number_format import interval, number, percent, quantity, scale, with_unit
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.parts import Answer, Bar, ParameterSummary, Verdict
-from bayeskin.report.words import faint_in_words, prior_in_words
+from bayeskin.report.words import (
+    better_fit_in_words,
+    faint_in_words,
+    named_in_words,
+    prior_in_words,
+    where_in_words,
+)
 
 _TONES = {Informed.WELL: "good", Informed.WEAKLY: "doubt", Informed.NOT: "none"}
 _THREE = ("low_90", "median", "high_90")
@@ -96,20 +102,19 @@ def _missing_physics(facts: RunFacts) -> Verdict:
         standing = facts.stage("diagnose").standing
         reason = [f"The physics that is missing is not known: the stage diagnose is {standing}."]
         return Verdict("not known yet", "none", reason, f"bayeskin diagnose {facts.config_path}")
-    rmse = [quantity(diagnosis["fit"][when]["rmse"], "N") for when in ("before", "after")]
     probability = number(diagnosis["smooth_probability"])
     smooth_line = f"Probability of a smooth effect that is not in the catalogue: {probability}."
     if diagnosis["verdict"] == "nothing-missing":
-        fit_line = f"The recording stays within what the model allows ({rmse[0]} RMSE)."
-        lines = [fit_line, smooth_line]
+        rmse = quantity(diagnosis["fit"]["before"]["rmse"], "N")
+        lines = [f"The recording stays within what the model allows ({rmse} RMSE).", smooth_line]
         if faint := faint_in_words(diagnosis):
             return Verdict("nothing that could be named", "doubt", [*faint, *lines])
         return Verdict("nothing", "good", lines)
     lines = [
-        f"{mechanism['statement']} (probability {number(mechanism['probability'])})"
-        for mechanism in diagnosis["mechanisms"]
+        where_in_words(diagnosis),
+        *named_in_words(diagnosis),
+        better_fit_in_words(diagnosis),
     ]
-    lines.append(f"The RMSE is {rmse[0]} without and {rmse[1]} with the best set of mechanisms.")
     remaining = len(diagnosis["remaining"])
     if remaining:
         lines.append(f"{remaining} window{'s' * (remaining != 1)} of the recording remain unexplained.")
