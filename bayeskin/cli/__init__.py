@@ -64,9 +64,10 @@ def cli() -> None:
     \b
     Start here:
       bayeskin doctor                          check the installation
-      bayeskin new && bayeskin run demo.toml   run all stages on the demo
+      bayeskin new && bayeskin run demo.toml   fit the demo
+      bayeskin diagnose demo.toml              name what is concealed in it
+      bayeskin report demo.toml                write both to one page
       bayeskin new test.xlsx -o test.toml      write your own configuration
-      bayeskin run test.toml                   run all stages on it
 
     \b
     This line makes your shell complete commands and options (zsh: zsh_source):
