@@ -21,8 +21,9 @@ def in_words(answer: Mapping[str, Any]) -> str:
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
     lines.append(f"  an unnamed smooth discrepancy: probability {answer['smooth_probability']:.2f}")
     lines += [f"  {faint}" for faint in faint_in_words(answer)]
+    windows = len(answer["located"])
     lines.append(
-        f"The model deviates from the recording in {len(answer['located'])} windows, "
+        f"The model deviates from the recording in {windows} window{'s' * (windows != 1)}, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
     )
     for recording in answer["recordings"]:
