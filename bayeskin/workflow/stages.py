@@ -152,7 +152,7 @@ def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None 
 
 def _diagnosis_lines(run: Run, stages: Mapping[str, Stage]) -> list[str]:
     """Returns the diagnosis of a run in sentences; there are none where it is not done."""
-    state, record = standing(run, stages)[diagnosis.NAME]
+    state, record = standing(run, stages).get(diagnosis.NAME, ("", None))
     return diagnosis_in_words(record.summary) if state == "done" and record is not None else []
 
 
