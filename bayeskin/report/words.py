@@ -43,22 +43,24 @@ def where_in_words(diagnosis: Mapping[str, Any]) -> str:
     windows = diagnosis["located"]
     if not windows:
         return "Recording and model differ nowhere by more than is allowed."
-    phases = list(dict.fromkeys(_phase_in_words(window) for window in windows))
+    by_cycle: dict[str, list[str]] = {}
+    for window in windows:
+        by_cycle.setdefault(_cycle_in_words(window), []).append(window["phase"])
+    where = "; ".join(", ".join(dict.fromkeys(phases)) + cycle for cycle, phases in by_cycle.items())
     worst = max(windows, key=lambda window: abs(window["mean_residual"]))
     side = "above" if worst["mean_residual"] > 0.0 else "below"
-    count = len(windows)
+    plural = "s" * (len(windows) != 1)
     return (
-        f"Recording and model differ in {count} window{'s' * (count != 1)}: {', '.join(phases)}. They differ "
-        f"most in the {_phase_in_words(worst)}, from {number(worst['t0'])} to {number(worst['t1'])} s, where "
-        f"the recording lies {quantity(abs(worst['mean_residual']), 'N')} {side} the model on average."
+        f"Recording and model differ in {len(windows)} window{plural}: {where}. They differ most in the "
+        f"{worst['phase']}{_cycle_in_words(worst)}, from {number(worst['t0'])} to {number(worst['t1'])} s, "
+        f"where the recording lies {quantity(abs(worst['mean_residual']), 'N')} {side} the model on average."
     )
 
 
-def _phase_in_words(window: Mapping[str, Any]) -> str:
-    """Returns the phase and the cycle of a window, and the recording where there are several."""
-    before_first = "" if window["cycle"] == 0 else f" of cycle {window['cycle']}"
-    recording = f" in {window['recording']}" if "recording" in window else ""
-    return f"{window['phase']}{before_first}{recording}"
+def _cycle_in_words(window: Mapping[str, Any]) -> str:
+    """Returns the cycle of a window, if it has begun, and the recording, where there are several."""
+    cycle = "" if window["cycle"] == 0 else f" of cycle {window['cycle']}"
+    return cycle + (f" in {window['recording']}" if "recording" in window else "")
 
 
 def named_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
