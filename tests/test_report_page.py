@@ -106,6 +106,15 @@ def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
     assert "The full model fails at the best values: the skin folds" in failed
 
 
+def test_the_held_out_error_has_a_column_where_there_is_one() -> None:
+    assert "held out" not in diagnosed_as({})
+    fit = summaries()["diagnose"]["fit"]
+    tested = {when: {**said, "rmse_held_out": 0.0312} for when, said in fit.items()}
+    text = diagnosed_as({"fit": tested})
+    assert "held out: after the second hold" in text
+    assert "31.2 mN" in text.replace("\N{NO-BREAK SPACE}", " ")
+
+
 def test_each_of_several_recordings_stands_beside_the_others() -> None:
     entry = {"rms_n": 2e-3, "noise_n": 1e-3, "sd_alone": {"E_c": 0.1}, "widens": {"E_c": 2.5}}
     text = diagnosed_as({"recordings": [
