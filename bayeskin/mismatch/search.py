@@ -11,6 +11,9 @@ A mechanism that is not in the catalogue is imitated by several mechanisms of th
 gains. The search therefore continues from a larger set only if one of its two hypotheses, alone or with an
 unnamed smooth discrepancy, is likelier than both hypotheses of the smaller set.
 
+At the end, higher maxima are searched for the sets that could become as likely as the most probable one, and
+mechanisms are added to those that are nearly as likely (`further_maxima`).
+
 Runs of the full model check a fit before the search continues from its set, and all likely sets at the end
 (`full_checks`). The weight of a set is its evidence times the prior odds of its mechanisms.
 """
@@ -25,7 +28,7 @@ from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, without_one
 from bayeskin.mismatch.candidates import Candidates
 from bayeskin.mismatch.full_checks import check, check_likely_sets, checked_best, is_checked_nearby
-from bayeskin.mismatch.further_maxima import find_further_maxima
+from bayeskin.mismatch.further_maxima import find_further_maxima, rivals
 from bayeskin.mismatch.hypotheses import Evidences, weight
 from bayeskin.mismatch.search_context import SearchContext, Tell, correction, gained, title
 from bayeskin.mismatch.search_record import Names, SearchResult
@@ -56,6 +59,8 @@ def search(
     searcher.weigh_likely_sets()
     if context.record.evidences:
         find_further_maxima(context, searcher.weigh_likely_sets)
+        if searcher.search_beside_rivals():
+            find_further_maxima(context, searcher.weigh_likely_sets)
     return context.record.result()
 
 
@@ -115,6 +120,21 @@ class Searcher:
             names = record.chosen
             check(self._context, [record.fits[names]])
             self._weigh([names])
+
+    def search_beside_rivals(self) -> bool:
+        """Adds mechanisms to the rivals of the most probable set; returns whether there was one to add to.
+
+        The search adds mechanisms to the likeliest set only. Where another set is nearly as likely, its
+        larger sets must be compared too; otherwise the likeliest set would gain by their absence.
+        """
+        context, expanded = self._context, self._candidates.expanded
+        new = [names for names in rivals(context, context.settings.close) if names not in expanded]
+        for names in new:
+            self._candidates.fit_beside(context.record.fits[names])
+        if new:
+            check_likely_sets(context)
+            self.weigh_likely_sets()
+        return bool(new)
 
     def _weigh(self, sets: Iterable[Names]) -> None:
         """Computes the evidences of sets that are new or whose fit has changed.

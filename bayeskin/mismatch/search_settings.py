@@ -43,6 +43,8 @@ class SearchSettings:
     exact : largest error of the forward model that needs no correction, RMS over bins, divided by the noise
 
     Further maxima
+    rival : difference in log-probability from the most probable set, up to which further maxima of a set are
+        searched for
     shapes : number of shapes of each part of a mechanism from which further maxima are searched for
     ends, ratios : positions of a permeability in its prior, and ratios of the moduli, from which fits start
     maxima : largest number of further maxima that are kept
@@ -73,6 +75,7 @@ class SearchSettings:
     checks: int = 4
     weighed: int = 6
     exact: float = 0.05
+    rival: float = 20.0
     shapes: int = 2
     ends: tuple[float, float] = (0.1, 0.9)
     ratios: tuple[float, ...] = (0.05, 0.2, 0.6, 1.5)
