@@ -5,7 +5,8 @@ could be added to the current set (`candidates`). The most promising ones are fi
 parameters free again. The set with the largest weight becomes the current set if it gains weight. A missing
 mechanism biases the tissue's parameters, so the sets that gain most are also fitted from other tissues. Then
 each mechanism of the best set is left out in turn. Where nothing gains any more, each mechanism of the best
-set is exchanged: it is left out, and every other mechanism is added to the remaining ones.
+set, or of its smallest likely part, is exchanged: it is left out, and every other mechanism is added to the
+remaining ones, at the tissue of this set.
 
 A mechanism that is not in the catalogue is imitated by several mechanisms of the catalogue, and each of these
 gains. The search therefore continues from a larger set only if one of its two hypotheses, alone or with an
@@ -72,6 +73,7 @@ class Searcher:
         self._candidates = Candidates(context)
         self._tissues: list[dict[str, float]] = []
         self._weighed: dict[Names, SetFit] = {}  # the fit to which each evidence belongs
+        self._exchanged: set[Names] = set()  # sets whose mechanisms were replaced by others
 
     def fit_base_model(self) -> None:
         """Fits the model without mechanisms. Raises InputError where no tissue of the priors runs."""
@@ -214,13 +216,34 @@ class Searcher:
         return [fit for fit in fits[: settings.alike] if gained(fit, current) >= least]
 
     def _exchange(self, current: SetFit) -> None:
-        """Fits sets in which each mechanism of the current set is replaced by another one."""
-        context, names = self._context, current.fit.names
-        if len(names) > 1:
-            for name in names:
-                smaller = context.record.fits.get(without_one(names, name, context.known))
-                if smaller is not None and smaller.fit.names not in self._candidates.expanded:
-                    self._candidates.fit_beside(smaller)
+        """Fits sets in which each mechanism of the smallest likely part of a set is replaced by another one.
+
+        The tests of the other mechanisms use the tissue of this part. The tissue that fits best without the
+        mechanism is biased, and at this tissue the tests may promise hardly any gain.
+        """
+        context, part = self._context, self._smallest_part(current)
+        names = part.fit.names
+        if names in self._exchanged:
+            return
+        self._exchanged.add(names)
+        smaller_sets = dict.fromkeys(without_one(names, name, context.known) for name in names)
+        for smaller in smaller_sets:
+            correction_n = correction(part) if context.solved(smaller) == context.solved(names) else ()
+            (at_tissue,) = context.ask([FitTask(smaller, part.fit.theta, 1, correction_n)])
+            if isinstance(at_tissue, SetFit):
+                self._candidates.fit_beside(at_tissue)
+
+    def _smallest_part(self, current: SetFit) -> SetFit:
+        """Returns the fit of the set with the fewest mechanisms among the likely parts of a set.
+
+        The set itself is one of its parts. Of several sets with as few mechanisms it is the likeliest.
+        """
+        parts = [
+            fit for names, fit in self._context.record.fits.items()
+            if names and set(names) <= set(current.fit.names)
+            and gained(current, fit) <= self._context.settings.close
+        ]  # fmt: skip
+        return min(parts, key=lambda fit: (len(fit.fit.names), -weight(fit.fit)), default=current)
 
     def _fit_from_other_tissues(self, current: SetFit) -> None:
         """Fits a set again from other tissues, with the present values of its mechanisms."""
