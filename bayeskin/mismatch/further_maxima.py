@@ -43,15 +43,19 @@ def find_further_maxima(context: SearchContext, weigh: Callable[[], None]) -> No
 def rivals(context: SearchContext, behind: float) -> list[Names]:
     """Returns the sets that could become as likely as the most probable set, the likeliest first.
 
-    A set that contains a rival is none: `fit_larger_sets` fits it from each higher maximum of the rival.
+    A set that contains one of the others is no rival: `fit_larger_sets` fits it again from their new maxima.
+    The set without mechanisms has no rivals, because all other sets contain it.
 
     behind : largest difference in log-probability from the most probable set
     """
     record, family = context.record, context.record.family
+    if not record.chosen:
+        return []
     sets = sorted((names for names in record.evidences if names), key=lambda names: -family.likeliest(names))
     least = family.likeliest(record.chosen) - behind
-    near = [names for names in sets if names != record.chosen and family.likeliest(names) > least]
-    return [names for names in near if not any(set(other) < set(names) for other in near)]
+    near = [names for names in sets if family.likeliest(names) > least]
+    smallest = [names for names in near if not any(set(other) < set(names) for other in near)]
+    return [names for names in smallest if names != record.chosen]
 
 
 def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], None]) -> None:

@@ -4,9 +4,9 @@ A hypothesis is a set of mechanisms, with or without an unnamed smooth discrepan
 `discrepancy`). Every mechanism has the same prior probability, and the discrepancy has it, too. The evidence
 of every hypothesis takes the force as linear near the set's fit, and uses the measured noise
 (`Unexplained.log_evidence`). This evidence has an error: the posterior is curved, and the fit may have ended
-at a lower maximum of it. The errors of the sets' log-evidences are taken as normal and independent, and both
-hypotheses of a set share one error. A probability is a share of the weights of all hypotheses that were
-compared, averaged over these errors. Sets that were never fitted do not count.
+at a lower maximum of it. Each mechanism is taken to add an independent normal error to the log-evidences of
+all sets that contain it. A probability is a share of the weights of all hypotheses that were compared,
+averaged over these errors. Sets that were never fitted do not count.
 
 A mechanism is named if its probability is at least 0.9. It is also named if its group of look-alikes has this
 probability together, and it is the likeliest of the group. There is an exception: nothing is named where the
@@ -42,7 +42,7 @@ class VerdictSettings:
     likelier_than_not : probability from which a discrepancy, or that nothing is missing, is likelier than not
     most_of_it : share of the squared misfit that named mechanisms must explain where a discrepancy is
         likelier than not
-    evidence_sd : sd of the error of a set's log-evidence [nats]
+    evidence_sd : sd of the error that each mechanism of a set adds to its log-evidence [nats]
     `benchmarks/diagnosis_scoreboard.py` shows which verdicts other values would give.
     """
 
@@ -123,7 +123,7 @@ def hypotheses_of(
 class Family:
     """All hypotheses that are compared.
 
-    evidence_sd : sd of the error of a set's log-evidence [nats]
+    evidence_sd : sd of the error that each mechanism of a set adds to its log-evidence [nats]
     """
 
     hypotheses: Sequence[Hypothesis]
@@ -158,11 +158,14 @@ class Family:
     @cached_property
     def _probabilities(self) -> Array:
         """Returns the probability (h,) of each hypothesis, as the mean over errors of the evidences."""
-        sets = sorted({hypothesis.names for hypothesis in self.hypotheses})
-        set_of = [sets.index(hypothesis.names) for hypothesis in self.hypotheses]
-        errors = self.evidence_sd * norm.ppf(qmc.Sobol(len(sets), rng=0).random(ERRORS))
         log_weights = np.array([hypothesis.log_weight for hypothesis in self.hypotheses])
-        log_weights = log_weights + errors[:, set_of]
+        names = sorted({name for hypothesis in self.hypotheses for name in hypothesis.names})
+        if names:
+            errors = self.evidence_sd * norm.ppf(qmc.Sobol(len(names), rng=0).random(ERRORS))
+            acts = np.array([[name in h.names for name in names] for h in self.hypotheses], dtype=float)
+            log_weights = log_weights + errors @ acts.T
+        else:
+            log_weights = log_weights[None]
         weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
         return np.asarray((weights / weights.sum(axis=1, keepdims=True)).mean(axis=0))
 
