@@ -147,7 +147,9 @@ def summaries() -> dict[str, dict[str, Any]]:
             "located": [{"t0": 0.0, "t1": 9.5, "phase": "rest", "cycle": 0, "mean_residual": -0.0586,
                          "significance": 0.001}],
             "remaining": [], "smooth_probability": 0.07, "nothing_probability": 0.0,
-            "best_set": ["device-friction"], "full_model": {"rmse": 0.0213, "fit_off_by": 0.0004},
+            "best_set": ["device-friction"], "held_out_set": None,
+            "sets": [{"mechanisms": ["device-friction"], "probability": 0.98}],
+            "full_model": {"rmse": 0.0213, "fit_off_by": 0.0004},
             "mechanisms": [
                 {"name": "device-friction", "probability": 0.98, "group": ["device-friction", "viscous-drag"],
                  "group_probability": 1.0, "contribution_n": 0.03, "statement": "The slide rubs: 60 mN.",
