@@ -80,6 +80,6 @@ def _commands(folder: RecordingFolder, key: str) -> Sequence[Sequence[str]]:
     config = folder.config.name
     return {
         CALIBRATE.key: [["run", config]],
-        MISSING.key: [["diagnose", config], ["report", config]],
+        MISSING.key: [["diagnose", config]],
         PREPARE.key: [["reduce", folder.device.name]],
     }[key]

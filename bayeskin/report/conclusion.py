@@ -64,6 +64,11 @@ def _verdict(answer: Mapping[str, Any]) -> str:
     return "The model lacks something that several mechanisms would explain"
 
 
+def _chance(value: float) -> str:
+    """Returns a probability with two digits, or with three next to 0 and 1."""
+    return number(value, 2) if 0.01 <= value <= 0.99 else probability(value)
+
+
 def _where(answer: Mapping[str, Any]) -> str:
     """Returns the sentence about the time windows, and about the markers if the recording has some."""
     before, windows = answer["fit"]["before"], answer["located"]
@@ -102,7 +107,7 @@ def _missing(answer: Mapping[str, Any]) -> str:
     best, smooth = answer["best_set"], answer["smooth_probability"]
     if answer["verdict"] == "nothing-missing":
         if not best:
-            chance = probability(answer["nothing_probability"])
+            chance = _chance(answer["nothing_probability"])
             return f"Nothing is missing from the model (probability {chance})"
         return (
             f"The model fits better with {listed(best)}, but too little or too uncertainly to name what is "
@@ -113,10 +118,10 @@ def _missing(answer: Mapping[str, Any]) -> str:
     if smooth >= LIKELY:
         return (
             "Something is missing that no mechanism of the catalogue describes "
-            f"(probability {probability(smooth)})"
+            f"(probability {_chance(smooth)})"
         )
     text = (
-        f"Something is missing (probability {probability(1.0 - answer['nothing_probability'])}), but no "
+        f"Something is missing (probability {_chance(1.0 - answer['nothing_probability'])}), but no "
         "mechanism is probable enough to be named"
     )
     candidates = _possible(answer, ())
@@ -126,9 +131,7 @@ def _missing(answer: Mapping[str, Any]) -> str:
 def _named(answer: Mapping[str, Any]) -> str:
     """Returns the sentence about named mechanisms, their look-alikes, and what may act too."""
     named, smooth = answer["mechanisms"], answer["smooth_probability"]
-    texts = [
-        f"{mechanism['name']} (probability {probability(mechanism['probability'])})" for mechanism in named
-    ]
+    texts = [f"{mechanism['name']} (probability {_chance(mechanism['probability'])})" for mechanism in named]
     parts = [f"The model lacks {listed(texts)}"]
     if len(named) == 1:
         statement = named[0]["statement"].rstrip(".")
@@ -143,7 +146,7 @@ def _named(answer: Mapping[str, Any]) -> str:
     if further := _possible(answer, stated):
         parts.append(f"{further} may act too")
     if smooth >= LIKELY:
-        parts.append(f"something without a name in the catalogue acts too ({probability(smooth)})")
+        parts.append(f"something without a name in the catalogue acts too ({_chance(smooth)})")
     return "; ".join(parts)
 
 
@@ -154,7 +157,7 @@ def _possible(answer: Mapping[str, Any], stated: Collection[str]) -> str:
         for name in set(names["mechanisms"]) - set(stated):
             acting[name] = acting.get(name, 0.0) + names["probability"]
     likeliest = sorted((name for name in acting if acting[name] >= POSSIBLE), key=lambda name: -acting[name])
-    return listed([f"{name} ({probability(acting[name])})" for name in likeliest[:MOST_LISTED]], "or")
+    return listed([f"{name} ({_chance(acting[name])})" for name in likeliest[:MOST_LISTED]], "or")
 
 
 def _rivals(answer: Mapping[str, Any], mechanism: Mapping[str, Any]) -> list[str]:

@@ -24,20 +24,6 @@ def polished_in_words(polished: Mapping[str, Any] | None) -> list[str]:
     return [f"Refined with the full model: {number(polished['gained'])} nats gained, {polished['message']}."]
 
 
-def faint_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
-    """Returns a sentence about the mechanisms that improve the fit although none could be named.
-
-    There is no sentence where the verdict is another, or where no set fits better.
-    """
-    if diagnosis["verdict"] != "nothing-missing" or not diagnosis["best_set"]:
-        return []
-    better = ", ".join(diagnosis["best_set"])
-    return [
-        f"The model fits better with {better}, but too little or too uncertainly to name it. The skin's "
-        "parameters depend on whether it acts, so do not rely on them."
-    ]
-
-
 def full_run_in_words(full: Mapping[str, Any]) -> str:
     """Returns a sentence about the run of the full model at the best values of a diagnosis."""
     if "message" in full:

@@ -1,4 +1,4 @@
-"""Diagnoses a recording of any protocol and device: locates mismatches, names mechanisms, and shows fits."""
+"""The stage of a diagnosis, for any protocol and device: locates mismatches, names mechanisms, shows fits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayeskin.config.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.forward.joint import JointForward
 from bayeskin.forward.reduced import ReducedForward, stands_for
-from bayeskin.json_files import plain, write_json
+from bayeskin.json_files import write_json
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.assess import assess
@@ -29,9 +29,9 @@ from bayeskin.types import Design, Surrogate
 from bayeskin.workflow import design, recording, training
 from bayeskin.workflow.diagnosis_answer import answer_of
 from bayeskin.workflow.diagnosis_figures import draw
+from bayeskin.workflow.diagnosis_forces import FORCES, forces_of
 from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, depends_on, open_context
-from bayeskin.workflow.diagnosis_text import in_words
-from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run, run_stages
+from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run
 from bayeskin.workflow.importing import markers_beside
 from bayeskin.workflow.model import model_spec
 from bayeskin.workflow.provenance import caption
@@ -39,23 +39,6 @@ from bayeskin.workflow.reducing import reduced_file
 
 KNOWN = "the pads must only open, no further and no faster than in the training of the reduced model"
 NAME = "diagnose"
-
-
-def diagnose(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
-    """Returns the answer of `bayeskin diagnose` for a configuration's run, or for recordings by themselves.
-
-    Outputs go to the run's folder. For recordings, they go to STEM-diagnosis in the folder of the first one.
-
-    sources : a configuration, or one or several recordings of one skin
-    device : file of the device with which the recordings were made
-    Raises InputError for bad input, and for a device without a reduced model.
-    """
-    run = opened(sources, reporter, device)
-    _files(run)  # a device without a reduced model is refused before anything is written
-    outcome = run_stages(run, stages_of(run.config))[-1]
-    answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / NAME}
-    text = in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
-    return plain({**answer, "text": text})
 
 
 def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> Run:
@@ -90,7 +73,7 @@ def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
     if device is not None:
         given |= {key: section.model_dump() for key, section in load_device_file(device)}
     config = config_of({"name": re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{stems}"), **given}, source)
-    return Run(config, source, folder / f"{stems}-diagnosis", reporter)
+    return Run(config, source, folder / f"{stems}-diagnosis", reporter, from_file=False)
 
 
 def stages_of(config: Config) -> dict[str, Stage]:
@@ -159,6 +142,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     diagnosis = assess(context, explanation)
     answer = {**answer_of(diagnosis, context.known), "seconds": time.monotonic() - started}
     write_json(run.at(NAME, "diagnosis.json"), answer)
+    write_json(run.at(NAME, FORCES), forces_of(context, diagnosis))
     figures = draw(run.folder / NAME, caption(run), context, diagnosis, answer["candidates"])
     return {**answer, "figures": [figure.name for figure in figures]}
 
@@ -184,7 +168,7 @@ STAGE = Stage(
     ("seed", "model", "parameters", "noise"),
     _work,
     _files,
-    format=2,
+    format=3,
 )
 
 

@@ -33,7 +33,7 @@ def in_words(answer: Mapping[str, Any]) -> str:
     )
     if best:
         lines.append(f"gain of log-evidence by single mechanisms: {best}")
-    lines.append(f"outputs in {answer['folder']}")
+    lines += [f"outputs in {answer['folder']}", f"report: {answer['page']}"]
     conclusion = conclusion_of(answer)
     return "\n".join([*lines, f"{conclusion.verdict}.", *conclusion.sentences])
 

@@ -23,6 +23,18 @@ HISTORY = {
     "low_90_n": [-0.02, 0.09, 0.18, 0.27],
     "high_90_n": [0.02, 0.13, 0.22, 0.31],
 }
+FORCES = [
+    {
+        "name": "",
+        "time_s": [0.25, 0.75, 1.25, 1.75],
+        "recorded_n": [0.0, 0.1, None, 0.3],
+        "before_n": [0.01, 0.18, 0.25, 0.3],
+        "after_n": [0.0, 0.11, 0.2, 0.29],
+        "low_90_n": [-0.02, 0.09, 0.18, 0.27],
+        "high_90_n": [0.02, 0.13, 0.22, 0.31],
+        "windows": [{"start_s": 0.5, "end_s": 1.5, "mean_n": -0.08}],
+    }
+]
 _NONE = np.full((2, 2, 4), np.nan)
 INDICES = SobolResult(
     names=("E_c", "p_init"), edges_s=np.arange(0.0, 2.5, 0.5),
@@ -159,7 +171,8 @@ def summaries() -> dict[str, dict[str, Any]]:
                            {"name": "backlash", "delta_score": -1.5, "standard_error": 0.2}],
             "fit": {
                 when: {"rmse": rmse, "rmse_by_phase": {"rest": rmse}, "rmse_held_out": None,
-                       "coverage90": 0.9, "rmse_of_mean": rmse}
+                       "coverage90": 0.9, "rmse_of_mean": rmse, "emulator": {"settled": True},
+                       "sampled": {"settled": True}}
                 for when, rmse in (("before", 0.08), ("after", 0.0247))
             },
             "unexplained": {
@@ -206,6 +219,6 @@ def facts(**changed: Any) -> RunFacts:
         "name": "forearm", "config_path": "runs/forearm.toml", "config_text": 'name = "forearm"\n',
         "config_sha256": "c" * 64, "version": "0.1.0", "seed": 7, "observation": "reaction", "mesh": "bricks",
         "parameters": PARAMETERS, "stages": stages,
-        "history": HISTORY, "indices": {"prior_gp": INDICES},
+        "history": HISTORY, "indices": {"prior_gp": INDICES}, "forces": FORCES,
     }  # fmt: skip
     return RunFacts(**{**given, **changed})

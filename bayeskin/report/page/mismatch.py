@@ -10,13 +10,7 @@ from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.parts import Block, Cell, Folded, Heading, Section, Table, Text, row
 from bayeskin.report.page.sections import absent, cell
-from bayeskin.report.words import faint_in_words, full_run_in_words, informed_in_words
-
-_VERDICTS = {
-    "nothing-missing": "The recording shows no physics that the model leaves out.",
-    "named": "The recording shows physics that the model leaves out, and it has been named.",
-    "unknown": "The model leaves something out, but no mechanism is likely enough to be named.",
-}
+from bayeskin.report.words import full_run_in_words, informed_in_words
 
 
 def mismatch(facts: RunFacts) -> Section:
@@ -24,7 +18,6 @@ def mismatch(facts: RunFacts) -> Section:
     diagnosis = facts.said("diagnose")
     blocks: list[Block] = list(absent(facts, "diagnose"))
     if diagnosis:
-        blocks.append(Text([" ".join([_VERDICTS[diagnosis["verdict"]], *faint_in_words(diagnosis)])]))
         if diagnosis["mechanisms"]:
             blocks.append(_mechanisms(diagnosis["mechanisms"]))
         if diagnosis["recordings"]:
