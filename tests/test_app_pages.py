@@ -135,7 +135,7 @@ def test_a_configuration_is_written_anew_only_if_what_it_is_made_of_has_changed(
     shutil.copy(shipped("data/demo.h5"), folder.stored)
     state(folder, DeviceFile())
     ask(folder, "missing")
-    assert asked == [["diagnose", "arm.toml"], ["report", "arm.toml"]]
+    assert asked == [["diagnose", "arm.toml"]]
     own = folder.config.read_text() + "# my own\n"
     folder.config.write_text(own)
     ask(folder, "calibrate")
