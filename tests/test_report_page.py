@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 from toys.finished_run import facts, summaries
@@ -237,3 +239,31 @@ def test_figures_of_further_recordings_follow_that_of_the_first() -> None:
     fits = pictures(both, "sample", ["fit"])
     assert [picture.title for picture in fits[1:]] == [f"{fits[0].title}, recording {n}" for n in (2, 10)]
     assert len(pictures(run, "sample", ["fit"])) == 1
+
+
+def test_markers_are_shown_with_their_noise_and_what_they_add(whole: str) -> None:
+    text = Walk(whole).text()
+    residual = (
+        "t 2 of 25 markers the skin moves otherwise than the model says (residual of 0.12 mm RMS at the"
+    )
+    assert [text.count(f"{start}{residual}") for start in ("A", "Before: a", "After: a")] == [1, 1, 1]
+    assert text.count("The noise of a marker's coordinate has an sd of 0.02 mm.") == 3
+    assert re.sub(r"\s", "", text).count("wouldbewiderbythesefactors:Ec4.5.") == 3
+    assert re.sub(r"\s", "", text).count("c36−12−0.30.1") == 3
+    assert "Before: at 2 of 25" not in diagnosed_as({"best_set": []})
+
+
+def test_a_page_without_markers_does_not_mention_them() -> None:
+    def bare(summary: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in summary.items() if key != "on_skin"}
+
+    run = facts()
+    fit = {when: bare(fit) for when, fit in summaries()["diagnose"]["fit"].items()}
+    said = {"sample": bare(summaries()["sample"]), "diagnose": {**summaries()["diagnose"], "fit": fit}}
+    changed = {
+        name: dataclasses.replace(run.stages[name], summary=summary, figures={})
+        for name, summary in said.items()
+    }
+    assert (
+        "arkers" not in Walk(render_page(dataclasses.replace(run, stages={**run.stages, **changed}))).text()
+    )

@@ -24,6 +24,24 @@ def polished_in_words(polished: Mapping[str, Any] | None) -> list[str]:
     return [f"Refined with the full model: {number(polished['gained'])} nats gained, {polished['message']}."]
 
 
+def markers_in_words(on_skin: Mapping[str, Any]) -> list[str]:
+    """Returns sentences about the markers of a fit: their residuals, their noise, and what they add."""
+    count, total = on_skin["significant"], on_skin["points"]
+    where = (
+        f"At {count} of {total} markers the skin moves otherwise than the model says"
+        if count
+        else f"All {total} markers move as the model says"
+    )
+    rms, sd = (f"{number(1e3 * on_skin[key], 2)} mm" for key in ("rms_m", "sd_m"))
+    adds = [f"{name} {number(factor, 2)}" for name, factor in on_skin["widens"].items() if factor >= ADDS]
+    wider = f"would be wider by these factors: {', '.join(adds)}" if adds else "would hardly be wider"
+    return [
+        f"{where} (residual of {rms} RMS at the largest opening, {on_skin['images']} images).",
+        f"The noise of a marker's coordinate has an sd of {sd}.",
+        f"Without the markers, the intervals {wider}.",
+    ]
+
+
 def full_run_in_words(full: Mapping[str, Any]) -> str:
     """Returns a sentence about the run of the full model at the best values of a diagnosis."""
     if "message" in full:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayeskin.report.conclusion import conclusion_of
-from bayeskin.report.words import agreement_in_words, full_run_in_words, informed_in_words
+from bayeskin.report.words import agreement_in_words, full_run_in_words, informed_in_words, markers_in_words
 
 
 def in_words(answer: Mapping[str, Any]) -> str:
@@ -22,8 +22,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
     )
     for recording in answer["recordings"]:
         lines += [agreement_in_words(recording), informed_in_words(recording)]
-    lines += [_skin_line(label, answer["fit"][label]) for label in ("before", "after")
-              if "on_skin" in answer["fit"][label]]  # fmt: skip
+    if "on_skin" in answer["fit"]["after"]:
+        lines += markers_in_words(answer["fit"]["after"]["on_skin"])
     lines.append(full_run_in_words(answer["full_model"]))
     after = answer["fit"]["after"]
     if not (after["emulator"]["settled"] and after["sampled"]["settled"]):
@@ -36,10 +36,3 @@ def in_words(answer: Mapping[str, Any]) -> str:
     lines += [f"outputs in {answer['folder']}", f"report: {answer['page']}"]
     conclusion = conclusion_of(answer)
     return "\n".join([*lines, f"{conclusion.verdict}.", *conclusion.sentences])
-
-
-def _skin_line(label: str, fit: Mapping[str, Any]) -> str:
-    """Returns a line about the markers that move otherwise than a fit says."""
-    located = fit["on_skin"]
-    line = f"{label}: at {located['significant']} of {located['points']} markers the skin moves otherwise"
-    return f"{line}, {1e3 * located['rms_m']:.3f} mm RMS at the largest opening"

@@ -64,6 +64,13 @@ def _parameter(prior: str, low: float, median: float, high: float, unit: str = "
     }  # fmt: skip
 
 
+ON_SKIN = {
+    "points": 25, "images": 31, "sd_m": 1.98e-5, "significant": 2, "rms_m": 1.2e-4,
+    "widens": {"E_c": 4.5, "p_init": 1.0},
+    "largest": [{"point": "c3", "place_m": [0.006, -0.012], "residual_m": [-0.0003, 0.0001]}],
+}  # fmt: skip
+
+
 def summaries() -> dict[str, dict[str, Any]]:
     """Returns the summaries by stage: a trusted posterior, and a diagnosis that has named a mechanism."""
     return {
@@ -137,7 +144,7 @@ def summaries() -> dict[str, dict[str, Any]]:
                        "shift_error_sd": 0.08}
                 for name, median in (("E_c", 51e3), ("p_init", 840.0), ("sd_rest", 0.0029))
             },
-            "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
+            "on_skin": ON_SKIN, "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
             "rms_sd_n": {"model": 0.0013, "surrogate": 0.0009, "noise": 0.0042},
         },
         "sobol": {
@@ -171,8 +178,8 @@ def summaries() -> dict[str, dict[str, Any]]:
                            {"name": "backlash", "delta_score": -1.5, "standard_error": 0.2}],
             "fit": {
                 when: {"rmse": rmse, "rmse_by_phase": {"rest": rmse}, "rmse_held_out": None,
-                       "coverage90": 0.9, "rmse_of_mean": rmse, "emulator": {"settled": True},
-                       "sampled": {"settled": True}}
+                       "coverage90": 0.9, "rmse_of_mean": rmse, "on_skin": ON_SKIN,
+                       "emulator": {"settled": True}, "sampled": {"settled": True}}
                 for when, rmse in (("before", 0.08), ("after", 0.0247))
             },
             "unexplained": {
