@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayeskin.inference.identify import Informed, grade_of
@@ -40,6 +40,12 @@ def markers_in_words(on_skin: Mapping[str, Any]) -> list[str]:
         f"The noise of a marker's coordinate has an sd of {sd}.",
         f"Without the markers, the intervals {wider}.",
     ]
+
+
+def markers_unused_in_words(work: str, names: Sequence[str]) -> str:
+    """Returns a sentence about recordings whose markers some work, such as "a study", does not use."""
+    begin = f"{work[0].upper()}{work[1:]}"
+    return f"{begin} infers from the force alone, so it does not use the markers of {', '.join(names)}."
 
 
 def full_run_in_words(full: Mapping[str, Any]) -> str:

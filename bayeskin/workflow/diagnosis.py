@@ -24,6 +24,7 @@ from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.explain import explain
 from bayeskin.recordings import fitting_width_s, read_recording
 from bayeskin.reduced.region import protocol_outside
+from bayeskin.report.words import markers_unused_in_words
 from bayeskin.surrogates import train
 from bayeskin.types import Design, Surrogate
 from bayeskin.workflow import design, recording, training
@@ -68,6 +69,9 @@ def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
     files = [{"file": os.path.relpath(file.resolve(), folder)} for file in sources]
     if len(sources) == 1 and markers_beside(source).exists():
         files[0]["markers"] = os.path.relpath(markers_beside(source.resolve()), folder)
+    unused = [file.stem for file in sources if markers_beside(file).exists()] if len(sources) > 1 else []
+    if unused:
+        reporter.log(markers_unused_in_words("a joint diagnosis", unused))
     given: dict[str, Any] = {"recording": files[0]} if len(files) == 1 else {"recordings": files}
     given["fit"] = {"bin_width_s": width_s}
     if device is not None:
