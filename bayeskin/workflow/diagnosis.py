@@ -31,6 +31,7 @@ from bayeskin.workflow import design, recording, training
 from bayeskin.workflow.diagnosis_answer import answer_of
 from bayeskin.workflow.diagnosis_figures import draw
 from bayeskin.workflow.diagnosis_forces import FORCES, forces_of
+from bayeskin.workflow.diagnosis_progress import tell_end, tell_tasks
 from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, depends_on, open_context
 from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run
 from bayeskin.workflow.importing import markers_beside
@@ -139,7 +140,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     context = context_of(run, source)
     learn = partial(_trained_emulator, seed=run.config.seed)
     store = run.store("answers", depends_on(context))
-    with asked(source, context, store, run.config.design.workers) as ask:
+    tell = partial(tell_tasks, run.reporter)
+    with asked(source, context, store, run.config.design.workers, tell) as ask:
         explanation = explain(context, ask, learn, run.reporter.log)
     if explanation is None:
         raise CannotGoOn("no set of mechanisms could be assessed")
@@ -148,6 +150,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     write_json(run.at(NAME, "diagnosis.json"), answer)
     write_json(run.at(NAME, FORCES), forces_of(context, diagnosis))
     figures = draw(run.folder / NAME, caption(run), context, diagnosis, answer["candidates"])
+    tell_end(run.reporter)
     return {**answer, "figures": [figure.name for figure in figures]}
 
 

@@ -67,7 +67,8 @@ def choose(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
         folder.mkdir(parents=True, exist_ok=True)
         context_source = source_of(run)
         context = context_of(run, context_source)
-        with asked(context_source, context, run.store("answers", depends_on(context)), WORKERS) as ask:
+        store = run.store("answers", depends_on(context))
+        with asked(context_source, context, store, WORKERS, lambda _: None) as ask:
             all_fits = [set_fit.fit for set_fit in searched(context, ask, reporter.log).fits.values()]
             fits = compete(all_fits, diagnosed["best_set"], context.known)
             experiments = _judged_protocols(fits, context, ask, reporter) if len(fits) > 1 else []
