@@ -24,6 +24,7 @@ from bayeskin.report.page.parts import Cell, Facts, Folded, Table, Text, row
 from bayeskin.report.page.render import page_environment
 from bayeskin.workflow.diagnosis_progress import LABEL as WHOLE_DIAGNOSIS
 from bayeskin.workflow.progress import TaskProgress
+from bayeskin.workflow.reducing import default_path, training_folder
 
 HERE = Path(__file__).parent
 _TITLES = {key: question.title for key, question in QUESTIONS.items()}
@@ -160,7 +161,8 @@ def _columns(sheets: Sequence[reading.SheetPreview]) -> list[tuple[str, str]]:
 def _questions(folder: RecordingFolder, stated: bool) -> list[Any]:
     """Returns the questions that can be asked; a device without a reduced model can be prepared."""
     unprepared = stated and not devices.has_reduced_model(folder)
-    keys = [key for key in QUESTIONS if key != PREPARE.key or unprepared]
+    unfinished = unprepared or training_folder(default_path(folder.device)).is_dir()
+    keys = [key for key in QUESTIONS if key != PREPARE.key or unfinished]
     return [QUESTIONS[key] for key in keys if key != MISSING.key or not unprepared]
 
 
