@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import bayeskin
-from bayeskin import cli
+from bayeskin import cli, shipped
 from bayeskin.errors import InputError
 from bayeskin.execution.local import Lost
 from bayeskin.workflow import doctor, doctor_models, remedies
@@ -178,6 +178,34 @@ def test_bayeskin_is_installed_anew_from_where_it_came(
     assert remedies.reinstall() == f"{pip} '{tmp_path}/a b.whl'"
     (tmp_path / "a b.whl").unlink()
     assert remedies.reinstall() == f"{pip} {remedies.WHERE_FROM}"
+
+
+def test_a_shipped_file_that_is_absent_or_damaged_is_brought_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*arguments: str) -> None:
+        own = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+        subprocess.run(["git", *own, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    def there(name: str) -> Path:
+        if not (tmp_path / name).is_file():
+            raise InputError(name, "it is absent", "bring it back")
+        return tmp_path / name
+
+    file = tmp_path / "surrogates" / "demo.h5"
+    file.parent.mkdir()
+    shutil.copy(shipped.shipped("surrogates/demo.h5"), file)
+    git("init")
+    git("add", ".")
+    git("commit", "-m", "files")
+    monkeypatch.setattr(remedies, "PACKAGE", tmp_path / "bayeskin")
+    monkeypatch.setattr(shipped, "shipped", there)
+    for harm in (Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:999])):
+        harm(file)
+        finding = doctor_models.finding_of("surrogate", doctor_models.surrogate_finding)
+        assert (finding.ok, "surrogates/demo.h5" in finding.state) == (False, True)
+        subprocess.run(finding.remedy, shell=True, check=True)
+        assert doctor_models.finding_of("surrogate", doctor_models.surrogate_finding).ok
 
 
 DAMAGED = """

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bayeskin.errors import InputError
-from bayeskin.workflow.remedies import compile_anew, reinstall
+from bayeskin.workflow.remedies import compile_anew, reinstall, restore
 
 if TYPE_CHECKING:
     from bayeskin.types import PadMotion
@@ -48,11 +48,17 @@ def finding_of(name: str, check: Callable[[], Finding]) -> Finding:
     """Returns the finding of a check; a check that raises any error is a finding too."""
     try:
         return check()
+    except InputError as error:  # a shipped file is absent or damaged
+        state, file = f"{error.where}: {error.problem}", error.where.partition(": ")[0]
+        return Finding(name, False, state, COMPLETE, restore(file))
+    except ImportError as error:
+        return Finding(name, False, _in_a_line(error), COMPLETE, reinstall())
     except Exception as error:  # a broken installation can raise any error
-        state = " ".join(f"{type(error).__name__}: {error}".split())
-        return Finding(
-            name, False, state, COMPLETE, reinstall() if isinstance(error, ImportError) else anew_or_again()
-        )
+        return Finding(name, False, _in_a_line(error), COMPLETE, anew_or_again())
+
+
+def _in_a_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def anew_or_again() -> str:

@@ -30,6 +30,14 @@ def reinstall() -> str:
     return shlex.join([sys.executable, "-m", "pip", "install", "--force-reinstall", *editable, str(source)])
 
 
+def restore(file: str) -> str:
+    """Returns the command that brings back a file that comes with bayeskin."""
+    checkout = PACKAGE.parent
+    if not (checkout / ".git").exists():
+        return reinstall()
+    return shlex.join(["git", "-C", str(checkout), "checkout", "--", file])
+
+
 def compile_anew() -> str:
     """Returns the command that deletes the compiled code, after which the models are compiled anew."""
     folder = folder_of_compiled_code(PACKAGE, Path.home())
