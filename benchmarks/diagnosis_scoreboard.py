@@ -35,7 +35,7 @@ from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch import hypotheses
 from bayeskin.mismatch.hypotheses import VerdictSettings
 from bayeskin.proof import score
-from bayeskin.workflow.diagnosis import diagnose
+from bayeskin.workflow.diagnosing import diagnose
 
 DATA = Path(__file__).parent.parent / "data"
 KEPT = Path(__file__).parent / "results" / "diagnosis_scoreboard.jsonl"
