@@ -5,12 +5,13 @@ VENV := .venv
 export OMP_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Commands and tests start many processes, each of which would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test docs test-oldest test-wheel
 run: $(VENV)/.installed
 	$(VENV)/bin/bayeskin run runs/demo.toml
 	$(VENV)/bin/bayeskin diagnose runs/demo.toml
-	$(VENV)/bin/bayeskin report runs/demo.toml
 
 test: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff check
@@ -48,4 +49,4 @@ test-wheel:
 	.venv-wheel/bin/python -m pip wheel --quiet --no-deps --wheel-dir .venv-wheel/dist .
 	.venv-wheel/bin/python -m pip install --quiet .venv-wheel/dist/*.whl
 	cd .venv-wheel && bin/bayeskin doctor && bin/bayeskin new && bin/bayeskin run demo.toml
-	cd .venv-wheel && bin/bayeskin diagnose demo.toml && bin/bayeskin report demo.toml
+	cd .venv-wheel && bin/bayeskin diagnose demo.toml

@@ -29,11 +29,11 @@ from bayeskin.mechanisms.mechanism import Instrument, Place, added
 from bayeskin.mechanisms.viscous_drag import speed_of
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.tasks import AnswerTasks, OtherProtocolTask, Task
+from bayeskin.mismatch.tasks import OtherProtocolTask, Task
 from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter
-from bayeskin.workflow import diagnosis, experiment
+from bayeskin.workflow import experiment
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.folder import Record, write_record
 
@@ -186,15 +186,22 @@ def fitted(name: str, **values: float) -> Fit:
     )
 
 
-def judged(fits: Sequence[Fit], ask: AnswerTasks = asked) -> list[Experiment]:
+def judged(fits: Sequence[Fit]) -> list[Experiment]:
     return ranked(
-        [weigh(variation, fits, KNOWN, ask, 0) for variation in variations(closed_form_model.MOTION, LIMITS)]
+        [
+            weigh(variation, fits, KNOWN, asked, 0)
+            for variation in variations(closed_form_model.MOTION, LIMITS)
+        ]
     )
 
 
-def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> None:
-    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits)
+@pytest.fixture(scope="module")
+def table() -> list[Experiment]:
+    """What each protocol tells about friction and drag, which are as likely."""
+    return judged([fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)])
+
+
+def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat(table: list[Experiment]) -> None:
     by_name = {experiment.protocol.name: experiment for experiment in table}
     assert table[0].protocol.name in ("quarter speed", "five times faster")
     assert by_name["five times faster"].gain_bits > 0.5
@@ -207,9 +214,7 @@ def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> No
     )
 
 
-def test_the_figure_shows_every_protocol_that_could_be_judged() -> None:
-    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits)
+def test_the_figure_shows_every_protocol_that_could_be_judged(table: list[Experiment]) -> None:
     figure = figure_experiments((*table, dataclasses.replace(table[0], gain_bits=np.nan)))
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
         experiment.protocol.name for experiment in reversed(table)
@@ -223,10 +228,10 @@ def test_failed_runs_are_counted_and_leave_a_row() -> None:
         return ["near folding" if i % DRAWS > 2 else force for i, force in enumerate(asked(tasks))]
 
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits, failing)
-    assert all(
-        np.isnan(experiment.gain_bits) and experiment.failed == 2 * (DRAWS - 3) for experiment in table
-    )
+    weighed = weigh(variations(closed_form_model.MOTION, LIMITS)[0], fits, KNOWN, failing, 0)
+    (row,) = ranked([weighed])
+    assert np.isnan(row.gain_bits)
+    assert row.failed == 2 * (DRAWS - 3)
     with pytest.raises(InputError, match="at least two"):
         judged(fits[:1])
 
@@ -339,7 +344,9 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     monkeypatch.setattr(experiment, "depends_on", lambda _: "x")
     monkeypatch.setattr(experiment, "asked", lambda *_: nullcontext(asked))
     monkeypatch.setattr(experiment, "caption", lambda _: "x")
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: {"best_set": ["rub"]})
+    monkeypatch.setattr(experiment, "diagnose", lambda *_: {"best_set": ["rub"]})
+    monkeypatch.setattr(experiment, "stages_of_page", lambda _: {})
+    monkeypatch.setattr(experiment, "write_page", lambda run, _: run.folder / "report.html")
     return Asked(tmp_path / "x.toml", tmp_path / "x" / "experiment")
 
 
@@ -360,7 +367,7 @@ def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
     with pytest.raises(InputError, match="no fit of rub; remove the run's folder `diagnose`"):
         experiment.choose([diagnosed.source], Silent())
     failed = {"ok": False, "message": "too few runs", "text": "design: failed: too few runs"}
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: failed)
+    monkeypatch.setattr(experiment, "diagnose", lambda *_: failed)
     assert experiment.choose([diagnosed.source], Silent()) == failed
 
 
@@ -374,7 +381,8 @@ def test_the_test_to_run_next_is_written_for_the_machine(
     words = answer["text"].splitlines()
     assert words[0] == "sets taken as equally probable: rub; or drag"
     assert best["sentence"] in words[1]
-    assert words[-1].startswith(f"Run next: {best['protocol']}.")
+    assert words[-2].startswith(f"Run next: {best['protocol']}.")
+    assert words[-1] == f"report: {diagnosed.folder.with_name('report.html')}"
     corners = np.loadtxt(diagnosed.folder / "next.csv", delimiter=",", skiprows=1)
     assert corners[-1, 0] == pytest.approx(best["seconds"], abs=1e-3)
     assert corners[:, 1].max() == pytest.approx(1e3 * max(c["reach_m"] for c in best["cycles"]), abs=1e-3)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from toys.quick_proof import COUNT, nothing_found
+from toys.worker_functions import opens
 
 import bayeskin
 from bayeskin.errors import InputError
@@ -46,13 +47,6 @@ def test_while_it_is_diagnosed_no_key_can_be_opened(concealed_set: Path, tmp_pat
     assert len(seals.read_keys(concealed_set)) == COUNT
 
 
-def opens(path: str) -> bool:
-    try:
-        return bool(Path(path).read_text())
-    except PermissionError:
-        return False
-
-
 def test_nor_by_a_worker_that_is_started_meanwhile(concealed_set: Path, tmp_path: Path) -> None:
     concealed_set = Path(shutil.copytree(concealed_set, tmp_path / "set:1, odd"))
     key_path = str(concealed_set / "seals" / "001.json")
@@ -74,7 +68,7 @@ def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(concealed_
         "        raise PermissionError(arguments[0])\n"
         "sys.addaudithook(refuse)\n"
         "from pathlib import Path\n"
-        "from bayeskin.workflow import diagnosis\n"
+        "from bayeskin.workflow import diagnosing\n"
         "from bayeskin.recordings import read_recording, segment\n"
         f"assert len(segment(read_recording(Path({str(recording)!r})))) == 14\n"
         "assert not [name for name in sys.modules if name.startswith('bayeskin.proof')]\n"
@@ -86,7 +80,7 @@ def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(concealed_
 
 
 def test_what_diagnoses_mentions_neither_proof_nor_seals() -> None:
-    for path in [*(PACKAGE / "mismatch").rglob("*.py"), *(PACKAGE / "workflow").glob("diagnosis*.py")]:
+    for path in [*(PACKAGE / "mismatch").rglob("*.py"), *(PACKAGE / "workflow").glob("diagnos*.py")]:
         tree = ast.parse(path.read_text())
         words = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         words |= {

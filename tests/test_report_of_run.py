@@ -6,11 +6,15 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from toys.finished_run import HISTORY, drawing, summaries
+import numpy as np
+import pytest
+from toys.finished_run import FORCES, HISTORY, drawing, summaries
 
+from bayeskin import storage
 from bayeskin.report.page.figures import FIGURES
-from bayeskin.workflow import folder, page, stages
-from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage, open_run, run_stages
+from bayeskin.types import Recording
+from bayeskin.workflow import diagnosing, diagnosis, folder, page, stages
+from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage
 
 CONFIG = 'seed = {seed}\n[recording]\nfile = "r.csv"\n'
 
@@ -27,6 +31,8 @@ def stubs(fails: str = "") -> dict[str, Stage]:
                     run.at(name, f"{figure}.svg").write_text(drawing(figure))
             if name == "sample":
                 folder.write_json(run.at(name, "bands.json"), HISTORY)
+            if name == "diagnose":
+                folder.write_json(run.at(name, "forces.json"), FORCES)
             return summaries().get(name, {})
 
         return work
@@ -56,19 +62,29 @@ def test_a_run_ends_with_its_page_and_report_makes_it_again(tmp_path: Path) -> N
     assert path.read_bytes() == first
 
 
-def test_the_report_of_a_diagnosed_run_ends_with_where_what_and_how_much(tmp_path: Path) -> None:
+def test_a_diagnosis_ends_with_its_page_also_without_a_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    u_m = np.interp(time_s, [0.0, 5.0, 9.0, 30.0, 34.0, 60.0], [0.0, 0.0, 3e-3, 3e-3, 6e-3, 6e-3])
+    storage.save(tmp_path / "arm.h5", Recording(time_s, u_m, 30.0 * u_m, "arm", "0" * 64))
+    own = {name: stage for name, stage in stubs().items() if name in ("recording", "diagnose")}
+    monkeypatch.setattr(diagnosis, "stages_of", lambda config: own)
+    said = diagnosing.diagnose([tmp_path / "arm.h5"], Silent())
+    path = tmp_path / "arm-diagnosis" / page.FILE
+    assert said["page"] == str(path)
+    assert f"report: {path}" in said["text"]
+    alone = path.read_text()
+    assert '<h1 id="question">The model lacks device-friction</h1>' in alone
+    assert "has not been run" not in alone
+    # With a configuration, the page also has the stages that were run before.
+    monkeypatch.setattr(stages, "stages_of", lambda config: stubs())
     config = configured(tmp_path)
-    assert "This was missing" not in stages.run(config, None, Silent(), stubs())["text"]
-    run_stages(open_run(config, Silent()), stubs(), "diagnose")
-    said = stages.report(config, Silent(), stubs())
-    assert said["text"].splitlines()[-4:] == [
-        "Recording and model differ in 1 window: rest. They differ most in the rest, from 0 to 9.5 s, where "
-        "the recording lies 58.6 mN below the model on average.",
-        "This was missing: device-friction (probability 0.98): The slide rubs: 60 mN.",
-        "The RMSE is 80 mN without and 24.7 mN with device-friction, and the 90 % band holds 90 % of the "
-        "recording without and 90 % with.",
-        f"report: {said['page']}",
-    ]
+    stages.run(config, None, Silent(), stubs())
+    diagnosing.diagnose([config], Silent())
+    both = (tmp_path / "case" / page.FILE).read_text()
+    assert "The model lacks device-friction</h1>" in both
+    assert 'id="sample-posterior"' in both
 
 
 def test_report_runs_nothing_and_names_what_is_missing(tmp_path: Path) -> None:

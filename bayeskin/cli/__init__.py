@@ -66,7 +66,6 @@ def cli() -> None:
       bayeskin doctor                          check the installation
       bayeskin new && bayeskin run demo.toml   fit the demo
       bayeskin diagnose demo.toml              name what is concealed in it
-      bayeskin report demo.toml                write both to one page
       bayeskin new test.xlsx -o test.toml      write your own configuration
 
     \b

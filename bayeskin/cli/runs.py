@@ -38,9 +38,7 @@ def report(config: Path) -> Mapping[str, Any]:
     """Write one HTML page about a run, from the stages that are done.
 
     The command runs no stage, and lists the stages that are missing. The page is report.html in the run's
-    folder. It needs no network and no other file, so it can be sent as a single file. After a diagnosis, the
-    last lines say where recording and model differ, what was missing, how well the model fits with it, and
-    where the page is.
+    folder. It needs no network and no other file, so it can be sent as a single file.
 
     \b
     Example:

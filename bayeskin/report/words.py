@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayeskin.inference.identify import Informed, grade_of
-from bayeskin.number_format import interval, number, percent, quantity
+from bayeskin.number_format import interval, number, quantity
 
 ADDS = 1.2  # a recording adds something where an interval would be wider by this factor without it
 
@@ -24,73 +24,28 @@ def polished_in_words(polished: Mapping[str, Any] | None) -> list[str]:
     return [f"Refined with the full model: {number(polished['gained'])} nats gained, {polished['message']}."]
 
 
-def faint_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
-    """Returns a sentence about the mechanisms that improve the fit although none could be named.
-
-    There is no sentence where the verdict is another, or where no set fits better.
-    """
-    if diagnosis["verdict"] != "nothing-missing" or not diagnosis["best_set"]:
-        return []
-    better = ", ".join(diagnosis["best_set"])
+def markers_in_words(on_skin: Mapping[str, Any]) -> list[str]:
+    """Returns sentences about the markers of a fit: their residuals, their noise, and what they add."""
+    count, total = on_skin["significant"], on_skin["points"]
+    where = (
+        f"At {count} of {total} markers the skin moves otherwise than the model says"
+        if count
+        else f"All {total} markers move as the model says"
+    )
+    rms, sd = (f"{number(1e3 * on_skin[key], 2)} mm" for key in ("rms_m", "sd_m"))
+    adds = [f"{name} {number(factor, 2)}" for name, factor in on_skin["widens"].items() if factor >= ADDS]
+    wider = f"would be wider by these factors: {', '.join(adds)}" if adds else "would hardly be wider"
     return [
-        f"The model fits better with {better}, but too little or too uncertainly to name it. The skin's "
-        "parameters depend on whether it acts, so do not rely on them."
+        f"{where} (residual of {rms} RMS at the largest opening, {on_skin['images']} images).",
+        f"The noise of a marker's coordinate has an sd of {sd}.",
+        f"Without the markers, the intervals {wider}.",
     ]
 
 
-def where_in_words(diagnosis: Mapping[str, Any]) -> str:
-    """Returns where recording and model differ: the windows' phases, and the window that differs most."""
-    windows = diagnosis["located"]
-    if not windows:
-        return "Recording and model differ nowhere by more than is allowed."
-    by_cycle: dict[str, list[str]] = {}
-    for window in windows:
-        by_cycle.setdefault(_cycle_in_words(window), []).append(window["phase"])
-    where = "; ".join(", ".join(dict.fromkeys(phases)) + cycle for cycle, phases in by_cycle.items())
-    worst = max(windows, key=lambda window: abs(window["mean_residual"]))
-    side = "above" if worst["mean_residual"] > 0.0 else "below"
-    plural = "s" * (len(windows) != 1)
-    return (
-        f"Recording and model differ in {len(windows)} window{plural}: {where}. They differ most in the "
-        f"{worst['phase']}{_cycle_in_words(worst)}, from {number(worst['t0'])} to {number(worst['t1'])} s, "
-        f"where the recording lies {quantity(abs(worst['mean_residual']), 'N')} {side} the model on average."
-    )
-
-
-def _cycle_in_words(window: Mapping[str, Any]) -> str:
-    """Returns the cycle of a window, if it has begun, and the recording, where there are several."""
-    cycle = "" if window["cycle"] == 0 else f" of cycle {window['cycle']}"
-    return cycle + (f" in {window['recording']}" if "recording" in window else "")
-
-
-def named_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
-    """Returns each mechanism that was named, with its probability and its statement."""
-    return [
-        f"{mechanism['name']} (probability {mechanism['probability']:.2f}): {mechanism['statement']}"
-        for mechanism in diagnosis["mechanisms"]
-    ]
-
-
-def better_fit_in_words(diagnosis: Mapping[str, Any]) -> str:
-    """Returns how well the model fits without and with the best set of mechanisms."""
-    before, after = (diagnosis["fit"][when] for when in ("before", "after"))
-    if not diagnosis["best_set"]:
-        return f"The RMSE of the model is {quantity(before['rmse'], 'N')}."
-    return (
-        f"The RMSE is {quantity(before['rmse'], 'N')} without and {quantity(after['rmse'], 'N')} with "
-        f"{', '.join(diagnosis['best_set'])}, and the 90 % band holds {percent(before['coverage90'])} of the "
-        f"recording without and {percent(after['coverage90'])} with."
-    )
-
-
-def diagnosis_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
-    """Returns where recording and model differ, what was missing, and how much better the fit is."""
-    missing = {
-        "nothing-missing": "Nothing that could be named is missing.",
-        "unknown": "Something is missing that could not be named.",
-        "named": f"This was missing: {' '.join(named_in_words(diagnosis))}",
-    }[diagnosis["verdict"]]
-    return [where_in_words(diagnosis), missing, better_fit_in_words(diagnosis)]
+def markers_unused_in_words(work: str, names: Sequence[str]) -> str:
+    """Returns a sentence about recordings whose markers some work, such as "a study", does not use."""
+    begin = f"{work[0].upper()}{work[1:]}"
+    return f"{begin} infers from the force alone, so it does not use the markers of {', '.join(names)}."
 
 
 def full_run_in_words(full: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 from bayeskin.config import Config
 from bayeskin.json_files import plain, write_json
 from bayeskin.number_format import at_edge
-from bayeskin.report.words import diagnosis_in_words, polished_in_words, prior_in_words
+from bayeskin.report.words import markers_in_words, polished_in_words, prior_in_words
 from bayeskin.workflow import design, diagnosis, indices, maximum, posterior, recording, training
 from bayeskin.workflow.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.workflow.executor import with_scheduler
@@ -67,6 +67,7 @@ def _write_summary(run: Run) -> Mapping[str, Any]:
             "posterior_mean": sampled["rmse"],
             "full_model_at_map": map_summary["rmse_of_full_model"],
         },
+        **({"on_skin": sampled["on_skin"]} if "on_skin" in sampled else {}),
         "coverage_90": {"whole": sampled["coverage_90"], "fitted": sampled["coverage_90_fitted"]},
         "rms_sd_n": sampled["rms_sd_n"],
         "sobol": summaries["sobol"],
@@ -118,8 +119,7 @@ def run(
     }
     if last in (None, "report"):
         document["page"] = write_page(opened, stages)
-        lines = [*_diagnosis_lines(opened, stages), f"report: {document['page']}"]
-        text = "\n".join([text, *lines])
+        text += f"\nreport: {document['page']}"
     return plain({**document, "text": text})
 
 
@@ -148,12 +148,6 @@ def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None 
     failed = any(states[name] == "failed" for name in missing)
     document = {"ok": not failed, "stage": "report", "verdict": "not finished", "missing": missing}
     return plain({**document, "folder": opened.folder, "page": page, "text": text})
-
-
-def _diagnosis_lines(run: Run, stages: Mapping[str, Stage]) -> list[str]:
-    """Returns the diagnosis of a run in sentences; there are none where it is not done."""
-    state, record = standing(run, stages).get(diagnosis.NAME, ("", None))
-    return diagnosis_in_words(record.summary) if state == "done" and record is not None else []
 
 
 def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str:
@@ -213,6 +207,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
             *_identifiability_lines([*said["identifiability"], *_length_sentences(said["lengths"])]),
             *_prior_lines(said["posterior"]),
             *said["remarks"],
+            *(markers_in_words(said["on_skin"]) if "on_skin" in said else []),
             f"{model}: RMSE {', '.join(off)}",
             error["message"],
             f"outputs in {folder}, {sum(said['seconds'].values()):.0f} s in all",
