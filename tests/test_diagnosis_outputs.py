@@ -168,7 +168,7 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     words = in_words(answer)
     assert "an unnamed smooth discrepancy: probability 0.97" in words
     assert words.splitlines()[-4:] == [*conclusion_of(answer).sentences, "report: x"]
-    assert words.splitlines()[-4] == f"{conclusion_of(answer).verdict}."
+    assert words.splitlines()[-5] == f"{conclusion_of(answer).verdict}."
     assert "an RMSE of 2.5 mN. The fitted model differs from it by 0.4 mN there." in words
     assert "The intervals are" not in words
     rough = {**answer, "fit": {"before": fits, "after": {**fits, "sampled": {"settled": False}}}}
