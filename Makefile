@@ -5,6 +5,8 @@ VENV := .venv
 export OMP_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Commands and tests start many processes, each of which would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test docs test-oldest test-wheel
 run: $(VENV)/.installed

@@ -11,16 +11,17 @@ import pytest
 from toys.closed_form_model import MOTION
 from toys.external_models import PARAMETERS, SPRING, TRUE
 from toys.spring_case import NOISE_N, SPACE, configured, refused, spring_case
+from toys.worker_functions import hooke
 
 from bayeskin import cli, report, storage
 from bayeskin.design import Wave
 from bayeskin.design_files import load_design
-from bayeskin.execution.local import local
+from bayeskin.execution.local import here, local
 from bayeskin.external.model import identity, simulate_with
 from bayeskin.runner import run_design
 from bayeskin.store import Store
 from bayeskin.types import PadMotion, Recording
-from bayeskin.workflow import stages
+from bayeskin.workflow import executor, stages
 from bayeskin.workflow.diagnosing import diagnose
 from bayeskin.workflow.engine import Silent
 
@@ -35,7 +36,13 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "save_figure", lambda figure, stem, provenance: None)
 
 
-def test_a_function_in_a_file_is_fitted_with_parameters_of_its_own(case: Path, undrawn: None) -> None:
+@pytest.fixture
+def quickly(undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets stages run without drawings and without other processes."""
+    monkeypatch.setattr(executor, "local", lambda workers: here)
+
+
+def test_a_function_in_a_file_is_fitted_with_parameters_of_its_own(case: Path, quickly: None) -> None:
     answer = stages.run(case, "map", Silent())
     assert answer["ok"], answer["text"]
     assert answer["polished"] is None
@@ -95,10 +102,6 @@ def test_any_callable_runs_through_the_runner(tmp_path: Path) -> None:
     )
 
 
-def hooke(theta: dict[str, float], time_s: np.ndarray, displacement_m: np.ndarray) -> np.ndarray:
-    return theta["stiffness"] * displacement_m
-
-
 def test_a_function_that_raises_is_a_run_that_failed() -> None:
     def raising(theta, time_s, displacement_m):
         raise ValueError("too\nstiff")
@@ -140,7 +143,7 @@ def test_a_function_is_asked_for_no_time_twice() -> None:
     ],
 )
 def test_what_cannot_be_used_is_told_in_one_line(
-    case: Path, capsys: pytest.CaptureFixture[str], forward: str, more: str, says: str, undrawn: None
+    case: Path, capsys: pytest.CaptureFixture[str], forward: str, more: str, says: str, quickly: None
 ) -> None:
     (case.parent / "broken.py").write_text("def force(:\n")
     assert says in refused(capsys, "design", configured(case, forward, more))

@@ -27,7 +27,7 @@ from bayeskin import report
 from bayeskin.design import Wave
 from bayeskin.design_files import load_design
 from bayeskin.errors import InputError, Unavailable
-from bayeskin.execution.local import local
+from bayeskin.execution.local import here, local
 from bayeskin.external.model import identity, simulate_own, simulate_server, simulate_with
 from bayeskin.external.umbridge import Client, server
 from bayeskin.finite_element import ModelSpec
@@ -35,7 +35,7 @@ from bayeskin.mechanisms import bin_means, catalogue, observed
 from bayeskin.runner import run_design
 from bayeskin.store import Store
 from bayeskin.types import Parameter
-from bayeskin.workflow import stages
+from bayeskin.workflow import executor, stages
 from bayeskin.workflow.doctor_models import FULL_MODEL_N, THETA
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.serve import Asked, ServedModel, open_server
@@ -47,7 +47,9 @@ def case(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets stages run without drawings and without other processes."""
+    monkeypatch.setattr(executor, "local", lambda workers: here)
     monkeypatch.setattr(report, "save_figure", lambda figure, stem, provenance: None)
 
 
@@ -102,7 +104,7 @@ def test_a_server_of_the_package_umbridge_gives_what_the_function_gives(umbridge
 
 
 def test_a_design_runs_through_a_server_and_its_refusals_are_failed_runs(
-    umbridge_url: str, case: Path, undrawn: None
+    umbridge_url: str, case: Path, quickly: None
 ) -> None:
     config = configured(case, f"{umbridge_url}#spring")
     answer = stages.run(config, "design", Silent())

@@ -44,6 +44,7 @@ bin_width_s = 1.0
 [design]
 points = [24]
 held_out = 6
+workers = 1
 """
 
 
@@ -268,23 +269,23 @@ def test_a_surrogate_of_another_model_is_refused(tmp_path: Path, bayeskin: Comma
     ids=["80 thousand", "ten million"],
 )
 def test_memory_grows_by_at_most_200_bytes_a_sample(tmp_path: Path, counts: tuple[int, int]) -> None:
-    peaks = []
-    for count in counts:
+    paths = [tmp_path / f"{count}.csv" for count in counts]
+    for count, path in zip(counts, paths, strict=True):
         time_s = np.linspace(0.0, 130.0, count)
         noise_n = 2e-3 * np.random.default_rng(1).standard_normal(count)
         force_n = spring()(TRUE, time_s, MOTION.at(time_s)) + noise_n
         table = np.column_stack([time_s, 1e3 * MOTION.at(time_s), force_n])
-        path = tmp_path / f"{count}.csv"
         np.savetxt(
             path, table, delimiter=",", fmt="%.6f", comments="", header="time (s),displacement (mm),force (N)"
         )
-        code = (
-            "import resource, sys; from pathlib import Path; from bayeskin.recordings import read_recording\n"
-            "read_recording(Path(sys.argv[1]))\n"
-            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
-        )
-        done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
-        peaks.append(1024 * int(done.stdout))
+    code = (
+        "import resource, sys; from pathlib import Path; from bayeskin.recordings import read_recording\n"
+        "for path in sys.argv[1:]:\n"
+        "    read_recording(Path(path))\n"
+        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *paths], capture_output=True, text=True, check=True)
+    peaks = [1024 * int(peak) for peak in done.stdout.split()]
     assert (peaks[1] - peaks[0]) / (counts[1] - counts[0]) < 200.0
 
 

@@ -69,9 +69,9 @@ def learnt(shear: Shear | None) -> Product:
     ],
 )
 def test_a_move_keeps_a_unit_normal(moves: object) -> None:
-    mean, error = unit_normal_variance(moves, 5, 1000)
+    mean, error = unit_normal_variance(moves, 5, 600)
     assert abs(mean - 1.0) < 4 * error + 0.005
-    assert error < 0.03
+    assert error < 0.04
 
 
 def test_tries_are_made_where_the_walkers_tell_a_distribution() -> None:
@@ -90,11 +90,11 @@ def test_tries_keep_the_shares_of_two_modes_between_walls() -> None:
     move = TriesMove(MoveCoordinates(None, np.zeros(3), np.full(3, 4.0)))
     random = np.random.RandomState(2)
     sampler = emcee.EnsembleSampler(30, 3, log_prob, moves=move, vectorize=True)
-    sampler.run_mcmc(emcee.State(random.uniform(0.0, 4.0, (30, 3)), random_state=random.get_state()), 1500)
-    means = [batch.mean() for batch in np.array_split(sampler.get_chain()[300:], 20)]
+    sampler.run_mcmc(emcee.State(random.uniform(0.0, 4.0, (30, 3)), random_state=random.get_state()), 900)
+    means = [batch.mean() for batch in np.array_split(sampler.get_chain()[200:], 20)]
     error = np.std(means, ddof=1) / np.sqrt(20)
     assert abs(np.mean(means) - 1.4) < 4 * error
-    assert error < 0.02
+    assert error < 0.03
 
 
 def test_a_mixture_s_density_is_that_of_its_draws() -> None:

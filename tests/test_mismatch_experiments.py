@@ -29,7 +29,7 @@ from bayeskin.mechanisms.mechanism import Instrument, Place, added
 from bayeskin.mechanisms.viscous_drag import speed_of
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.tasks import AnswerTasks, OtherProtocolTask, Task
+from bayeskin.mismatch.tasks import OtherProtocolTask, Task
 from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter
@@ -186,15 +186,22 @@ def fitted(name: str, **values: float) -> Fit:
     )
 
 
-def judged(fits: Sequence[Fit], ask: AnswerTasks = asked) -> list[Experiment]:
+def judged(fits: Sequence[Fit]) -> list[Experiment]:
     return ranked(
-        [weigh(variation, fits, KNOWN, ask, 0) for variation in variations(closed_form_model.MOTION, LIMITS)]
+        [
+            weigh(variation, fits, KNOWN, asked, 0)
+            for variation in variations(closed_form_model.MOTION, LIMITS)
+        ]
     )
 
 
-def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> None:
-    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits)
+@pytest.fixture(scope="module")
+def table() -> list[Experiment]:
+    """What each protocol tells about friction and drag, which are as likely."""
+    return judged([fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)])
+
+
+def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat(table: list[Experiment]) -> None:
     by_name = {experiment.protocol.name: experiment for experiment in table}
     assert table[0].protocol.name in ("quarter speed", "five times faster")
     assert by_name["five times faster"].gain_bits > 0.5
@@ -207,9 +214,7 @@ def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> No
     )
 
 
-def test_the_figure_shows_every_protocol_that_could_be_judged() -> None:
-    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits)
+def test_the_figure_shows_every_protocol_that_could_be_judged(table: list[Experiment]) -> None:
     figure = figure_experiments((*table, dataclasses.replace(table[0], gain_bits=np.nan)))
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
         experiment.protocol.name for experiment in reversed(table)
@@ -223,10 +228,10 @@ def test_failed_runs_are_counted_and_leave_a_row() -> None:
         return ["near folding" if i % DRAWS > 2 else force for i, force in enumerate(asked(tasks))]
 
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits, failing)
-    assert all(
-        np.isnan(experiment.gain_bits) and experiment.failed == 2 * (DRAWS - 3) for experiment in table
-    )
+    weighed = weigh(variations(closed_form_model.MOTION, LIMITS)[0], fits, KNOWN, failing, 0)
+    (row,) = ranked([weighed])
+    assert np.isnan(row.gain_bits)
+    assert row.failed == 2 * (DRAWS - 3)
     with pytest.raises(InputError, match="at least two"):
         judged(fits[:1])
 

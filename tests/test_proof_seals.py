@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from toys.quick_proof import COUNT, nothing_found
+from toys.worker_functions import opens
 
 import bayeskin
 from bayeskin.errors import InputError
@@ -44,13 +45,6 @@ def test_while_it_is_diagnosed_no_key_can_be_opened(concealed_set: Path, tmp_pat
         document = pipeline.prove(copy, Silent(), diagnose=peeks)
     assert document["scoreboard"]["judged"] == COUNT
     assert len(seals.read_keys(concealed_set)) == COUNT
-
-
-def opens(path: str) -> bool:
-    try:
-        return bool(Path(path).read_text())
-    except PermissionError:
-        return False
 
 
 def test_nor_by_a_worker_that_is_started_meanwhile(concealed_set: Path, tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ def test_a_worker_that_dies_loses_only_its_own_point_which_is_run_again(
 
 def test_a_point_that_kills_three_workers_is_a_failed_row(tmp_path: Path) -> None:
     simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=99)
-    design = run(tmp_path / "out" / "a.store", SHORT, simulate)
+    design = run(tmp_path / "out" / "a.store", SHORT, simulate, local(1))
     stiff = SHORT.theta[:, 0] > 3e5
     assert stiff.any()
     np.testing.assert_array_equal(design.ok, ~stiff)

@@ -15,6 +15,7 @@ from toys.closed_form_model import SPACE
 from toys.design_runs import run
 
 from bayeskin.design import first_wave
+from bayeskin.execution.local import local
 
 HERE = Path(__file__).parent
 
@@ -22,7 +23,7 @@ HERE = Path(__file__).parent
 def test_workers_have_one_thread_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    design = run(tmp_path / "a.store", first_wave(SPACE, 1, 0, seed=1), unreliable_models.threads)
+    design = run(tmp_path / "a.store", first_wave(SPACE, 1, 0, seed=1), unreliable_models.threads, local(1))
     assert design.messages == ("1,1,1",)
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ

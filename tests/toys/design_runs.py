@@ -11,7 +11,7 @@ from toys.closed_form_model import toy_simulate
 from toys.unreliable_models import COARSE_S, WAVE
 
 from bayeskin.design import Wave
-from bayeskin.execution.local import Map, local
+from bayeskin.execution.local import Map, here
 from bayeskin.runner import run_design
 from bayeskin.store import Store
 from bayeskin.types import Design
@@ -20,10 +20,11 @@ SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])
 
 
 def run(
-    path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, run_all: Map | None = None, **options: Any
+    path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, run_all: Map = here, **options: Any
 ) -> Design:
+    """The design of a wave, from runs of a toy that a store beside it keeps."""
     with Store(path, "toy") as store:
-        return run_design(store, wave, COARSE_S, simulate, "toy", run_all or local(1), **options)
+        return run_design(store, wave, COARSE_S, simulate, "toy", run_all, **options)
 
 
 def assert_same_rows(design: Design, expected: Design) -> None:

@@ -87,7 +87,8 @@ class Exact:
         self = cls(
             Model.of(Layout.of(table), (low, high), Priors()), y, errors, covariances, np.ones(len(log_prior))
         )
-        log = log_prior + [self._log_evidence(levels) for levels in covariances]
+        parts = np.array_split(covariances, 1 + len(covariances) // 1000)  # of a few megabytes each
+        log = log_prior + np.concatenate([self._log_evidences(part) for part in parts])
         weights = np.exp(log - log.max())
         return replace(self, weights=weights / weights.sum())
 
@@ -99,7 +100,8 @@ class Exact:
     def draw(self, count: int, rng: np.random.Generator) -> State:
         """Draws of the posterior, as a state of so many walkers."""
         chosen = rng.choice(len(self.weights), count, p=self.weights)
-        z = np.array([self._draw(self.covariances[s], rng) for s in chosen])
+        errors = rng.multivariate_normal(np.zeros(len(self._error)), self._error, count)
+        z = np.array([self._draw(self.covariances[s], e, rng) for s, e in zip(chosen, errors, strict=True)])
         layout, dim = self.model.layout, self.y.shape[1]
         ends = np.cumsum([dim * unit.shape[1] for unit in self._units])
         parts = [part.reshape(count, -1, dim) for part in np.split(z, ends[:-1], axis=1)]
@@ -110,7 +112,7 @@ class Exact:
         covariances = tuple(np.moveaxis(self.covariances[chosen], 1, 0))
         return State(x, np.zeros(x.shape[:2]), parts[0], tuple(values), covariances)
 
-    @property
+    @cached_property
     def _units(self) -> list[Array]:
         """The matrices (N, n) of the layout, and of the units of each level."""
         levels = self.model.layout.levels
@@ -128,29 +130,38 @@ class Exact:
         error[range(n), :, range(n), :] = self.errors
         return error.reshape(n * dim, n * dim)
 
-    def _prior(self, levels: Array) -> tuple[Array, Array]:
-        """Mean and covariance of z."""
+    @property
+    def _mean(self) -> Array:
+        """Mean of z under the prior."""
+        mean = np.zeros(self._design.shape[1])
+        mean[: self.model.centre.size] = self.model.centre.ravel()
+        return mean
+
+    def _log_evidences(self, covariances: Array) -> Array:
+        """Logs of the marginal likelihoods (s,), up to a constant, at covariances (s, l, d, d)."""
+        size = self.y.size
+        known = self._design[:, : self.model.sd.size] * self.model.sd.ravel()
+        shared = np.array([unit @ unit.T for unit in self._units[1:]])
+        levels = np.einsum("lab,slij->saibj", shared, covariances).reshape(-1, size, size)
+        marginal = levels + known @ known.T + self._error
+        away = self.y.ravel() - self._design @ self._mean
+        distances = np.linalg.solve(marginal, np.broadcast_to(away, (len(levels), size))[..., None])[..., 0]
+        return np.asarray(-0.5 * (np.linalg.slogdet(marginal)[1] + distances @ away))
+
+    def _draw(self, levels: Array, error: Array, rng: np.random.Generator) -> Array:
+        """A draw of z: a draw of the prior, corrected by the measurement that it would not have given.
+
+        error (N d,) : a draw of the errors of measurement
+        """
         blocks = [np.diag(self.model.sd.ravel() ** 2)]
         blocks += [
             np.kron(np.eye(unit.shape[1]), level) for unit, level in zip(self._units[1:], levels, strict=True)
         ]
-        mean = np.zeros(self._design.shape[1])
-        mean[: self.model.centre.size] = self.model.centre.ravel()
-        return mean, block_diag(*blocks)
-
-    def _log_evidence(self, levels: Array) -> float:
-        mean, prior = self._prior(levels)
+        prior = block_diag(*blocks)
+        z = self._mean + np.linalg.cholesky(prior) @ rng.standard_normal(len(prior))
+        away = self.y.ravel() - self._design @ z - error
         covariance = self._design @ prior @ self._design.T + self._error
-        away = self.y.ravel() - self._design @ mean
-        return float(-0.5 * (np.linalg.slogdet(covariance)[1] + away @ np.linalg.solve(covariance, away)))
-
-    def _draw(self, levels: Array, rng: np.random.Generator) -> Array:
-        """A draw of z: a draw of the prior, corrected by the measurement that it would not have given."""
-        mean, prior = self._prior(levels)
-        z = rng.multivariate_normal(mean, prior)
-        given = self._design @ z + rng.multivariate_normal(np.zeros(len(self._error)), self._error)
-        covariance = self._design @ prior @ self._design.T + self._error
-        return z + prior @ self._design.T @ np.linalg.solve(covariance, self.y.ravel() - given)
+        return z + prior @ self._design.T @ np.linalg.solve(covariance, away)
 
 
 def grid(levels: int, count: int) -> tuple[Array, Array]:

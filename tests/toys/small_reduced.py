@@ -26,13 +26,13 @@ from bayeskin.types import ParameterSpace
 NAMES = ("preconditioning", "solid-viscoelasticity")
 SETTINGS = BuildSettings(
     base_runs=7,
-    runs=7,
+    runs=5,
     base=(34, 26),
     each=(14, 8),
     base_points=200,
     set_points=260,
     base_shadows=6,
-    set_shadows=12,
+    set_shadows=10,
 )
 
 

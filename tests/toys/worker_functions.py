@@ -57,3 +57,16 @@ def added(path: str) -> int:
         for n in range(ADDED):
             store.add([os.getpid(), n], {"force_n": np.full(3000, n)})
     return os.getpid()
+
+
+def opens(path: str) -> bool:
+    """Returns whether this process may read a file."""
+    try:
+        return bool(Path(path).read_text())
+    except PermissionError:
+        return False
+
+
+def hooke(theta: dict[str, float], time_s: np.ndarray, displacement_m: np.ndarray) -> np.ndarray:
+    """The force of a spring."""
+    return theta["stiffness"] * displacement_m
