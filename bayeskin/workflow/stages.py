@@ -154,7 +154,7 @@ def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None 
 
 def _diagnosis_lines(run: Run, stages: Mapping[str, Stage]) -> list[str]:
     """Returns the verdict and the three sentences of a run's diagnosis; none where it is not done."""
-    state, record = standing(run, stages)[diagnosis.NAME]
+    state, record = standing(run, stages).get(diagnosis.NAME, ("not run", None))
     if state != "done" or record is None:
         return []
     tests = judged_tests(run)
