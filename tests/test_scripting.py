@@ -35,7 +35,7 @@ BLOCKS = re.findall(
 
 @pytest.fixture(scope="module")
 def said() -> dict[str, Any]:
-    """The names that the documentation's blocks leave, run on a coarse mesh, in long steps and with coarse proposals."""
+    """The names that the documentation's blocks leave, run on a coarse mesh and with coarse proposals."""
 
     def coarsely(spec: ModelSpec, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
         return simulate(replace(spec, refinement=0, tolerance=1e-2), motion, theta)
