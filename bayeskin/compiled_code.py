@@ -30,6 +30,13 @@ def keep_compiled_code(package: Path, home: Path, temporary: Path) -> Path | Non
     return folder
 
 
+def folder_of_compiled_code(package: Path, home: Path) -> Path:
+    """Returns the folder below which numba keeps the compiled code of a package."""
+    if named := os.environ.get(VARIABLE):
+        return Path(named)
+    return package if _is_writable(package / "__pycache__") else home / ".cache" / "numba"
+
+
 def _is_writable(folder: Path) -> bool:
     """Returns whether a file can be written to a folder, which is made where it does not exist."""
     if not folder.is_absolute():  # the home is not known

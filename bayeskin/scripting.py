@@ -28,7 +28,7 @@ from bayeskin.json_files import plain
 from bayeskin.recordings import Stated, idealised_motion, read_recording, segment, stated_unit
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import BinnedForce, PadMotion, Recording, Simulation
-from bayeskin.workflow import diagnosis
+from bayeskin.workflow import diagnosing
 from bayeskin.workflow.calibration import log_posterior_of
 from bayeskin.workflow.engine import Run, Silent
 from bayeskin.workflow.model import model_spec
@@ -170,7 +170,7 @@ def diagnose(
         _run_on(recording, _with_surrogate(recording, settings, None), folder) as run,
         _without_caller_script(),
     ):
-        return diagnosis.diagnose([run.config_path], Silent())
+        return diagnosing.diagnose([run.config_path], Silent())
 
 
 @contextmanager

@@ -35,7 +35,7 @@ from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch import hypotheses
 from bayeskin.mismatch.hypotheses import VerdictSettings
 from bayeskin.proof import score
-from bayeskin.workflow.diagnosis import diagnose
+from bayeskin.workflow.diagnosing import diagnose
 
 DATA = Path(__file__).parent.parent / "data"
 KEPT = Path(__file__).parent / "results" / "diagnosis_scoreboard.jsonl"
@@ -69,6 +69,10 @@ SHARES = {
 }
 RULES = {
     "rule in use": VerdictSettings(),
+    "log-evidences without an error": VerdictSettings(evidence_sd=0.0),
+    "log-evidences with an error of 2 nats": VerdictSettings(evidence_sd=2.0),
+    "log-evidences with an error of 4 nats": VerdictSettings(evidence_sd=4.0),
+    "log-evidences with an error of 6 nats": VerdictSettings(evidence_sd=6.0),
     "no condition on the explained share": VerdictSettings(most_of_it=0.0),
     "explained share of at least 0.8": VerdictSettings(most_of_it=0.8),
     "explained share of at least 0.95": VerdictSettings(most_of_it=0.95),
@@ -251,14 +255,15 @@ def by_present_rule(
     if "sets" not in said:
         return dict(said)
     evidences_of = {tuple(tested["mechanisms"]): tested for tested in said["sets"]}
-    family = hypotheses.Family([
+    compared = [
         hypothesis for names, evidence in evidences_of.items()
         for hypothesis in hypotheses.hypotheses_of(
             names,
             hypotheses.Evidences(evidence["log_evidence_alone"], evidence["log_evidence_with_smooth"]),
             settings,
         )
-    ])  # fmt: skip
+    ]  # fmt: skip
+    family = hypotheses.Family(compared, settings.evidence_sd)
     judgement = hypotheses.judge_family(family, catalogue(), said["explained"], settings)
     values = said["fit"]["after"]["theta"]
     named = [
@@ -267,7 +272,10 @@ def by_present_rule(
                         if p.name in values}}
         for mechanism in judgement.named
     ]  # fmt: skip
-    return {**said, "verdict": judgement.verdict, "mechanisms": named}
+    return {
+        **said, "verdict": judgement.verdict, "mechanisms": named,
+        "nothing_probability": judgement.nothing_probability,
+    }  # fmt: skip
 
 
 def _share(board: Mapping[str, Any], path: tuple[str, ...]) -> str:

@@ -156,12 +156,12 @@ def fits(context: DiagnosisContext) -> dict[tuple[str, ...], SetFit]:
     return done
 
 
-def at_all_points(context: DiagnosisContext, fitted: Fit) -> Fit:
-    """Returns a fit to some points as a fit to all points of a context."""
+def at_all_points(context: DiagnosisContext, fitted: Fit) -> OnSkin | None:
+    """Returns the residuals of a fit to some points at all points of a context."""
     run = context.run(fitted.names, fitted.theta)
     if isinstance(run, str):
         raise SystemExit(run)
-    return replace(fitted, log_posterior=context.posterior(fitted.names, [run]))
+    return on_skin(context.posterior(fitted.names, [run]), fitted.theta, context.motion)
 
 
 def outline_mm(file: Path, per_mm: float) -> Array:
@@ -232,9 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         done = fits(context)
         all_points = opened(recording, whole, Path(made) / "whole")
         best = max(done, key=lambda names: done[names].fit.log_evidence)
-        located = {
-            names: on_skin(at_all_points(all_points, done[names].fit), context.motion) for names in done
-        }
+        located = {names: at_all_points(all_points, done[names].fit) for names in done}
     outline, best_located = outline_mm(folder / "keloid_skin.geo", per_mm), located[best]
     assert best_located is not None
     table = [_row(names, done[names].fit, place) for names, place in located.items() if place is not None]

@@ -6,7 +6,9 @@ import os
 import shutil
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from toys.app_page import DEVICE, Visitor, served, until
@@ -19,14 +21,18 @@ from bayeskin.app.comparison import RunAnswer, by_parameter, run_answer, table
 from bayeskin.app.devices import state
 from bayeskin.app.estimate import OVERRUN, SHIPPED_DESIGN_S, USUAL_S, seconds_left, usual_seconds
 from bayeskin.app.jobs import Job, State
-from bayeskin.app.questions import CALIBRATE, ask
-from bayeskin.app.recordings import RecordingFolder
+from bayeskin.app.pages import job_page, recordings_page
+from bayeskin.app.questions import CALIBRATE, MISSING, ask
+from bayeskin.app.recordings import RecordingFolder, open_recordings
 from bayeskin.app.steps import steps
 from bayeskin.config import config_of
 from bayeskin.config.device import DeviceFile
 from bayeskin.shipped import shipped
+from bayeskin.workflow.diagnosis_progress import tell_tasks
 from bayeskin.workflow.engine import Silent, open_run, run_stages
 from bayeskin.workflow.folder import Record, write_record
+from bayeskin.workflow.new import new_config
+from bayeskin.workflow.progress import Tasks
 from bayeskin.workflow.stages import stages_of
 
 REDUCED, NEW = shipped("surrogates/article-device-reduced.h5"), "device-reduced.h5"
@@ -135,7 +141,7 @@ def test_a_configuration_is_written_anew_only_if_what_it_is_made_of_has_changed(
     shutil.copy(shipped("data/demo.h5"), folder.stored)
     state(folder, DeviceFile())
     ask(folder, "missing")
-    assert asked == [["diagnose", "arm.toml"], ["report", "arm.toml"]]
+    assert asked == [["diagnose", "arm.toml"]]
     own = folder.config.read_text() + "# my own\n"
     folder.config.write_text(own)
     ask(folder, "calibrate")
@@ -168,3 +174,32 @@ def test_two_calibrations_are_compared(tmp_path: Path) -> None:
         assert bars == [3, 3]  # stiffness, share, tau
         assert "100 N/m" in shown
         assert "200 N/m" in shown
+
+
+def test_a_diagnosis_states_the_share_that_is_done_and_a_range_of_the_time_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recordings = open_recordings(tmp_path / "recordings")
+    folder = recordings.new("arm.h5")
+    (folder.path / "original").mkdir()
+    shutil.copy(shipped("data/demo.h5"), folder.stored)
+    new_config([folder.stored], folder.config)
+    run = open_run(folder.config, Silent())
+    run_stages(run, stages_of(run.config), "recording")
+    folder.job.mkdir()
+    (folder.job / jobs.OUTPUT).write_text("search: pad-slip: +3.0 nats\n")
+    now_s = time.monotonic()
+    told = Tasks(folder.job / jobs.PROGRESS)
+    monkeypatch.setattr("bayeskin.workflow.diagnosis_progress.USUAL", 200)
+    for done, at_s in ((50, now_s - 120.0), (100, now_s)):
+        tell_tasks(SimpleNamespace(progress=partial(told.report, now_s=at_s)), done)  # type: ignore[arg-type]
+    running = Job(folder.job, MISSING.key, State.RUNNING, time.time() - 130.0, None)
+    page = job_page("/x", recordings, folder, running)
+    assert '<progress max="1" value="0.5">50 %</progress>' in page
+    assert "50 % <strong></strong>" in page
+    assert "100 tasks done, about 200 are usual" in page
+    assert (
+        "<dt>time left, estimated</dt><dd>2 to 8 minutes</dd>" in page
+    )  # half of it is left, at a quarter in two minutes
+    monkeypatch.setattr(jobs, "job_of", lambda _: running)
+    assert "What is missing: running, 50 %" in recordings_page("/x", recordings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import json
 import os
@@ -17,10 +18,11 @@ from toys.laboratory_exports import NUMBERS, D, F, T
 from toys.laboratory_files import text, workbook
 
 from bayeskin import storage
-from bayeskin.app import uploads
+from bayeskin.app import jobs, uploads
 from bayeskin.app.recordings import open_recordings
 from bayeskin.config.device import DeviceFile, load_device_file
 from bayeskin.types import Recording
+from bayeskin.workflow.folder import locked
 
 BARE = text([["clock", "pull", "cell"], *NUMBERS], ";")
 
@@ -249,3 +251,48 @@ def test_a_form_of_endless_length_is_refused(owner: Visitor, measured: Path) -> 
     at = dropped(owner, "form.csv", measured.read_bytes())
     assert owner.ask("POST", f"{at}/device", b"gauge=" + b"1" * 200_000).status == 413
     assert owner.ask("POST", f"{at}/device", b"\xff=\xff").status == 400
+
+
+def test_a_recording_is_removed_after_a_confirmation_and_nothing_outside_its_folder(
+    owner: Visitor, measured: Path
+) -> None:
+    at = dropped(owner, "gone.csv", measured.read_bytes())
+    folder, outside = owner.page.folder / "gone", owner.page.folder.parent / "kept"
+    outside.mkdir()
+    (outside / "own.csv").write_text("own")
+    (folder / "link").symlink_to(outside)
+    (folder / "gone").mkdir()
+    assert "Remove gone for good" in owner.ask("GET", at).text
+    refused = owner.fill(f"{at}/remove")
+    assert refused.status == 400
+    assert "the removal is not confirmed; tick the box first" in refused.text
+    assert folder.is_dir()
+    answer = owner.fill(f"{at}/remove", sure="yes")
+    assert (answer.status, answer.headers["location"]) == (303, f"{owner.page.access.root}/")
+    assert not folder.exists()
+    assert not list(owner.page.folder.glob(".removed-*"))
+    assert (outside / "own.csv").read_text() == "own"
+    assert owner.ask("GET", at).status == 404
+    assert owner.fill(f"{at}/remove", sure="yes").status == 404
+    assert dropped(owner, "gone.csv", measured.read_bytes()) == at  # the name is free again
+
+
+def test_a_recording_in_which_something_works_is_not_removed(owner: Visitor, measured: Path) -> None:
+    at = dropped(owner, "busy.csv", measured.read_bytes())
+    folder = owner.page.folder / "busy"
+    with locked(folder / "busy"):
+        said = owner.fill(f"{at}/remove", sure="yes")
+        assert (said.status, "another bayeskin" in said.text) == (400, True)
+    (folder / "job").mkdir()
+    (folder / "job" / jobs.OUTPUT).touch()
+    (folder / "job" / jobs.REQUEST).write_text('{"question": "calibrate", "started_s": 0.0}')
+    with open(folder / "job" / jobs.LOCK, "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        said = owner.fill(f"{at}/remove", sure="yes")
+        assert (said.status, "a job runs already; stop it first" in said.text) == (400, True)
+        assert "A job runs at present. Stop it first." in said.text
+    assert folder.is_dir()
+    (owner.page.folder / ".removed-half" / "original").mkdir(parents=True)
+    assert "removed-half" not in owner.ask("GET", "/").text
+    assert owner.fill(f"{at}/remove", sure="yes").status == 303
+    assert not folder.exists()

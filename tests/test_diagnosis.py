@@ -13,7 +13,7 @@ from bayeskin import storage
 from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.mechanisms import catalogue, laws
 from bayeskin.types import PadMotion, Recording
-from bayeskin.workflow.diagnosis import diagnose
+from bayeskin.workflow.diagnosing import diagnose
 from bayeskin.workflow.engine import Silent
 
 THETA = {"E_c": 300e3, "E_s": 20e3, "k_c": 3e-14, "k_s": 2e-13, "p_init": 300.0}

@@ -120,6 +120,21 @@ def test_a_wrong_list_of_recordings_is_one_line(tmp_path: Path, text: str, line:
         opened([tmp_path / "case.toml"], Silent())
 
 
+def test_markers_beside_one_of_several_recordings_are_not_used_and_one_line_says_so(tmp_path: Path) -> None:
+    class Heard(Silent):
+        def log(self, message: str) -> None:
+            heard.append(message)
+
+    heard: list[str] = []
+    (tmp_path / "second-markers.h5").touch()
+    run = opened(two(tmp_path), Heard())
+    said = "A joint diagnosis infers from the force alone, so it does not use the markers of second."
+    assert heard == [said]
+    assert [section.markers for section in run.config.each_recording] == [None, None]
+    assert opened([tmp_path / "second.h5"], Heard()).config.each_recording[0].markers == "second-markers.h5"
+    assert heard == [said]
+
+
 def test_what_recordings_may_share_is_listed(tmp_path: Path) -> None:
     two(tmp_path)
     case = tmp_path / "case.toml"

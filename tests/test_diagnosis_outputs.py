@@ -27,8 +27,10 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.report.conclusion import conclusion_of
 from bayeskin.workflow.diagnosis_answer import candidate_entries, remainder_entry
 from bayeskin.workflow.diagnosis_figures import draw
+from bayeskin.workflow.diagnosis_forces import forces_of
 from bayeskin.workflow.diagnosis_text import in_words
 
 CREEP_S = 20.0
@@ -160,11 +162,13 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     answer: dict[str, Any] = {
         "verdict": "unknown", "mechanisms": [], "nothing_probability": 0.02, "smooth_probability": 0.974,
         "located": [], "remaining": [], "recordings": [], "best_set": [], "candidates": [], "folder": "x",
-        "fit": {"before": fits, "after": fits}, "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4},
+        "sets": [], "held_out_set": None, "page": "x", "fit": {"before": fits, "after": fits},
+        "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4},
     }  # fmt: skip
     words = in_words(answer)
     assert "an unnamed smooth discrepancy: probability 0.97" in words
-    assert "before: RMSE 1.0 mN, 3.0 mN after the second hold, which was not fitted" in words
+    assert tuple(words.splitlines()[-3:]) == conclusion_of(answer).sentences
+    assert words.splitlines()[-4] == f"{conclusion_of(answer).verdict}."
     assert "an RMSE of 2.5 mN. The fitted model differs from it by 0.4 mN there." in words
     assert "The intervals are" not in words
     rough = {**answer, "fit": {"before": fits, "after": {**fits, "sampled": {"settled": False}}}}
@@ -186,10 +190,6 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     assert "B alone informs no parameter of the skin; without it, no interval would be much wider" in joint
     assert "B contradicts the others, by 5.2 sd" in joint
     assert "C: RMS residual 5.0 mN, 5.0 sd of its noise; it could not be fitted alone" in joint
-    faint = in_words({**answer, "verdict": "nothing-missing", "best_set": ["pre-stretch"]})
-    assert "The model fits better with pre-stretch" in faint
-    for alike in ({"verdict": "nothing-missing"}, {"best_set": ["x"]}):
-        assert "fits better with" not in in_words({**answer, **alike})
 
 
 # Figures
@@ -231,6 +231,18 @@ def test_before_and_after_have_their_band_and_what_was_not_fitted() -> None:
     assert [line.get_xdata()[0] for line in left.get_lines() if line.get_linestyle() == "--"] == [60.0]  # type: ignore[index]
     whole = report.figure_before_after(BINNED, closed_form_model.MOTION, drawn(8e-3), drawn(2e-3), None)
     assert len(whole.axes) == 3
+
+
+def test_the_page_gets_the_forces_and_windows_of_each_recording() -> None:
+    context = DiagnosisContext(BINNED, None, closed_form_model.MOTION, None, ALONE.surrogate.space, 0)  # type: ignore[arg-type]
+    before = dataclasses.replace(drawn(8e-3), located=located(0.0 * BINNED.force_n, WINDOW))
+    diagnosis = Diagnosis(SimpleNamespace(), before, drawn(2e-3), [], None, "")  # type: ignore[arg-type]
+    (entry,) = json.loads(json.dumps(plain(forces_of(context, diagnosis)), allow_nan=False))
+    assert entry["name"] == ""
+    assert entry["windows"] == [{"start_s": 15.0, "end_s": 45.0, "mean_n": 5e-3}]
+    for name, left_n in (("before", 8e-3), ("after", 2e-3), ("low_90", 5e-3), ("high_90", -1e-3)):
+        np.testing.assert_allclose(np.subtract(entry["recorded_n"], entry[f"{name}_n"]), left_n, atol=1e-12)
+    np.testing.assert_allclose(entry["time_s"], BINNED.time_s)
 
 
 def test_the_base_s_parameters_that_leave_their_intervals_are_said() -> None:

@@ -11,12 +11,16 @@ import tempfile
 from collections import namedtuple
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from bayeskin import cli
-from bayeskin.workflow import doctor, doctor_models
+import bayeskin
+from bayeskin import cli, shipped
+from bayeskin.errors import InputError
+from bayeskin.execution.local import Lost
+from bayeskin.workflow import doctor, doctor_models, remedies
 from bayeskin.workflow.engine import Silent
 
 MODELS = ["reduced model", "full model", "posterior", "surrogate"]
@@ -30,6 +34,10 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def broken(said: dict[str, Any]) -> dict[str, str]:
     return {finding["name"]: finding["state"] for finding in said["findings"] if not finding["ok"]}
+
+
+def remedies_of(said: dict[str, Any]) -> dict[str, str]:
+    return {finding["name"]: finding["remedy"] for finding in said["findings"] if not finding["ok"]}
 
 
 def test_the_models_give_the_stored_numbers_here(
@@ -59,6 +67,7 @@ def test_a_model_that_gives_another_number_is_broken(
     finding = doctor_models.CHECKS[name]()
     assert (finding.name, finding.ok) == (name, False)
     assert "within" in finding.needed
+    assert finding.remedy == f"{remedies.compile_anew()}; if this does not help: {remedies.reinstall()}"
 
 
 USES = """
@@ -115,8 +124,9 @@ def test_a_package_that_is_absent_or_too_old_is_named(
     shown = capsys.readouterr().out
     assert end.value.code == 1
     assert "BROKEN  numpy" in shown
-    assert "needed: >=99" in shown
+    assert f"needed: >=99; remedy: {sys.executable} -m pip install 'numpy>=99'" in shown
     assert "BROKEN  no-such-package: not installed" in shown
+    assert f"{sys.executable} -m pip install 'no-such-package>=1.2'" in shown
     assert "ok      scipy" in shown
     assert "no-such-wheel" not in shown  # needed elsewhere only
     assert shown.splitlines()[-1] == "something is broken"
@@ -131,6 +141,7 @@ def test_a_part_that_cannot_be_imported_is_a_finding_and_no_crash(
     said = doctor.examine(tmp_path, Silent())
     assert list(broken(said)) == ["linear solver"]
     assert "ModuleNotFoundError" in broken(said)["linear solver"]
+    assert remedies_of(said) == {"linear solver": remedies.reinstall()}
 
 
 @pytest.mark.usefixtures("quick")
@@ -143,10 +154,107 @@ def test_a_folder_without_room_or_access_is_told(tmp_path: Path, monkeypatch: py
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(tempfile, "TemporaryFile", denied)
-    assert broken(doctor.examine(tmp_path, Silent())) == {
+    said = doctor.examine(tmp_path, Silent())
+    assert broken(said) == {
         "disk space": "0.0 GB free",
         "write access": f"{tmp_path}: permission denied",
     }
+    assert remedies_of(said) == {
+        "disk space": f"remove files from the disk of {tmp_path}, or work in a folder on another disk",
+        "write access": "work in a folder of your own: cd ~",
+    }
+
+
+def test_bayeskin_is_installed_anew_from_where_it_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkout = Path(bayeskin.__file__).parent.parent
+    pip = f"{sys.executable} -m pip install --force-reinstall"
+    assert remedies.reinstall() == f"{pip} --editable {checkout}"
+    (tmp_path / "a b.whl").touch()
+    url = json.dumps({"url": (tmp_path / "a b.whl").as_uri()})
+    monkeypatch.setattr(remedies, "PACKAGE", tmp_path / "bayeskin")
+    monkeypatch.setattr(metadata, "distribution", lambda name: SimpleNamespace(read_text=lambda file: url))
+    assert remedies.reinstall() == f"{pip} '{tmp_path}/a b.whl'"
+    (tmp_path / "a b.whl").unlink()
+    assert remedies.reinstall() == f"{pip} {remedies.WHERE_FROM}"
+
+
+def test_a_shipped_file_that_is_absent_or_damaged_is_brought_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*arguments: str) -> None:
+        own = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+        subprocess.run(["git", *own, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    def there(name: str) -> Path:
+        if not (tmp_path / name).is_file():
+            raise InputError(name, "it is absent", "bring it back")
+        return tmp_path / name
+
+    file = tmp_path / "surrogates" / "demo.h5"
+    file.parent.mkdir()
+    shutil.copy(shipped.shipped("surrogates/demo.h5"), file)
+    git("init")
+    git("add", ".")
+    git("commit", "-m", "files")
+    monkeypatch.setattr(remedies, "PACKAGE", tmp_path / "bayeskin")
+    monkeypatch.setattr(shipped, "shipped", there)
+    for harm in (Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:999])):
+        harm(file)
+        finding = doctor_models.finding_of("surrogate", doctor_models.surrogate_finding)
+        assert (finding.ok, "surrogates/demo.h5" in finding.state) == (False, True)
+        subprocess.run(finding.remedy, shell=True, check=True)
+        assert doctor_models.finding_of("surrogate", doctor_models.surrogate_finding).ok
+
+
+DAMAGED = """
+import sys
+import numba
+from bayeskin.workflow.doctor_models import Finding, finding_of
+sys.path.insert(0, ".")
+from compiled import double
+finding = finding_of("model", lambda: Finding("model", double(2.0) == 4.0, "runs"))
+print(finding.ok, finding.remedy)
+"""
+
+
+def test_code_that_was_compiled_wrongly_or_is_damaged_is_mended_by_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "compiled.py").write_text(
+        "import numba\n\n\n@numba.njit(cache=True)\ndef double(x):\n    return 2.0 * x\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "a cache")}
+
+    def examined() -> list[str]:
+        done = subprocess.run(
+            [sys.executable, "-c", DAMAGED], env=environment, cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip().split(" ", 1)
+
+    assert examined() == ["True"]
+    (index,) = (tmp_path / "a cache").rglob("*.nbi")
+    index.write_bytes(b"damaged")
+    ok, remedy = examined()
+    assert ok == "False"
+    subprocess.run(remedy.split("; ")[0], shell=True, check=True)
+    assert examined() == ["True"]
+
+
+@pytest.mark.usefixtures("quick")
+def test_processes_that_do_not_begin_are_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> object:
+        raise InputError("workers", "they die before they are ready", "check the memory")
+
+    monkeypatch.setattr("bayeskin.execution.local.run_parallel", refused)
+    (finding,) = doctor_models.findings_of_models(Silent())
+    assert (finding.name, finding.ok) == ("models", False)
+    assert finding.state == "workers: they die before they are ready"
+    monkeypatch.setattr(
+        "bayeskin.execution.local.run_parallel", lambda *_: iter([(0, Lost("its process was killed"))])
+    )
+    (finding,) = doctor_models.findings_of_models(Silent())
+    assert (finding.ok, finding.remedy) == (False, doctor_models.MEMORY)
 
 
 @pytest.mark.parametrize(

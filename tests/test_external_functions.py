@@ -22,7 +22,7 @@ from bayeskin.runner import run_design
 from bayeskin.store import Store
 from bayeskin.types import PadMotion, Recording
 from bayeskin.workflow import executor, stages
-from bayeskin.workflow.diagnosis import diagnose
+from bayeskin.workflow.diagnosing import diagnose
 from bayeskin.workflow.engine import Silent
 
 

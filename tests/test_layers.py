@@ -76,7 +76,7 @@ BELOW = {
         "report",
     },
 }
-BELOW["workflow"] |= {"proof"}
+BELOW["workflow"] |= {"proof", "compiled_code"}
 BELOW["scripting"] = BELOW["workflow"] | {"workflow"}
 BELOW["app"] = BELOW["workflow"] | {"workflow"}
 BELOW["cli"] = BELOW["workflow"] | {"workflow", "app"}

@@ -14,6 +14,7 @@ from toys.inference_problems import NOISE, TRUTH, toy_problem
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
+from bayeskin.inference.marker_gain import widened_without_markers
 from bayeskin.inference.marker_likelihood import CameraMotion, MarkerLikelihood
 from bayeskin.types import Array, Markers, ParameterSpace
 
@@ -147,3 +148,23 @@ def test_a_climb_uses_the_markers_slopes(joint: tuple[LogPosterior, Array]) -> N
     assert top.information[0, 0] > 1.5 * alone.information[0, 0]
     sd_m = log_posterior.from_sampling(top.vector)[-1]
     assert SD_M / 1.6 < sd_m < 1.6 * SD_M
+
+
+def test_without_the_markers_a_parameter_is_as_much_wider_as_their_information_says(
+    joint: tuple[LogPosterior, Array],
+) -> None:
+    log_posterior, theta = joint
+    values = dict(zip(log_posterior.names, map(float, np.concatenate([theta, [SD_M]])), strict=True))
+    widens = widened_without_markers(log_posterior, values)
+    assert list(widens) == list(log_posterior.surrogate.space.names)
+    vector = log_posterior.vector(values)
+    both = gauss_newton(log_posterior, vector, None, 0).information[:5, :5]
+    force = gauss_newton(replace(log_posterior, markers=None), vector[:-1], None, 0).information[:5, :5]
+    sds = [np.sqrt(np.diag(np.linalg.inv(known + 12.0 * np.eye(5)))) for known in (force, both)]
+    np.testing.assert_allclose(list(widens.values()), sds[0] / sds[1], rtol=1e-6)
+    assert widens["E_c"] > 1.2  # the points move with the first two parameters
+    assert log_posterior.markers is not None
+    still = Linear(log_posterior.surrogate.space, np.zeros((2, 3, 5, 2)))
+    blind = replace(log_posterior, markers=replace(log_posterior.markers, model=still))
+    unmoved = widened_without_markers(blind, values)
+    np.testing.assert_allclose(list(unmoved.values()), 1.0, rtol=1e-6)

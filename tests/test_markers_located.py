@@ -15,7 +15,7 @@ from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.inference.marker_error import mesh_correction, smooth_errors
 from bayeskin.inference.marker_likelihood import CameraMotion, MarkerLikelihood
-from bayeskin.mismatch.on_skin import on_skin, strains
+from bayeskin.mismatch.on_skin import OnSkin, on_skin, strains
 from bayeskin.report import figure_on_skin
 from bayeskin.surrogates.marker_surrogate import train_marker_surrogate
 from bayeskin.types import Array, Markers, PadMotion, ParameterSpace
@@ -57,11 +57,16 @@ def fit_with(missing_m: Array) -> Any:
     return SimpleNamespace(log_posterior=replace(posterior, markers=likelihood), theta=theta)
 
 
+def located_with(missing_m: Array) -> OnSkin | None:
+    fit = fit_with(missing_m)
+    return on_skin(fit.log_posterior, fit.theta, MOTION)
+
+
 def test_where_nothing_is_missing_no_point_is_significant() -> None:
-    located = on_skin(fit_with(np.zeros_like(PLACES_M)), MOTION)
+    located = located_with(np.zeros_like(PLACES_M))
     assert located is not None
     assert not located.significant.any()
-    assert on_skin(SimpleNamespace(log_posterior=toy_problem()), MOTION) is None  # type: ignore[arg-type]
+    assert on_skin(toy_problem(), {}, MOTION) is None
 
 
 def test_skin_that_does_not_stretch_is_found_where_it_is() -> None:
@@ -70,7 +75,7 @@ def test_skin_that_does_not_stretch_is_found_where_it_is() -> None:
     inside = np.linalg.norm(PLACES_M - middle, axis=1) < radius
     stretch = 5.0 / 36.0
     missing_m = np.where(inside[:, None], -stretch * (PLACES_M - middle), 0.0)
-    located = on_skin(fit_with(missing_m), MOTION)
+    located = located_with(missing_m)
     assert located is not None
     assert located.significant.sum() >= 3
     assert inside[located.significant].mean() > 0.7

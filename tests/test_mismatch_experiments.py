@@ -33,7 +33,7 @@ from bayeskin.mismatch.tasks import OtherProtocolTask, Task
 from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter
-from bayeskin.workflow import diagnosis, experiment
+from bayeskin.workflow import experiment
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.folder import Record, write_record
 
@@ -344,7 +344,9 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     monkeypatch.setattr(experiment, "depends_on", lambda _: "x")
     monkeypatch.setattr(experiment, "asked", lambda *_: nullcontext(asked))
     monkeypatch.setattr(experiment, "caption", lambda _: "x")
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: {"best_set": ["rub"]})
+    monkeypatch.setattr(experiment, "diagnose", lambda *_: {"best_set": ["rub"]})
+    monkeypatch.setattr(experiment, "stages_of_page", lambda _: {})
+    monkeypatch.setattr(experiment, "write_page", lambda run, _: run.folder / "report.html")
     return Asked(tmp_path / "x.toml", tmp_path / "x" / "experiment")
 
 
@@ -365,7 +367,7 @@ def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
     with pytest.raises(InputError, match="no fit of rub; remove the run's folder `diagnose`"):
         experiment.choose([diagnosed.source], Silent())
     failed = {"ok": False, "message": "too few runs", "text": "design: failed: too few runs"}
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: failed)
+    monkeypatch.setattr(experiment, "diagnose", lambda *_: failed)
     assert experiment.choose([diagnosed.source], Silent()) == failed
 
 
@@ -379,7 +381,8 @@ def test_the_test_to_run_next_is_written_for_the_machine(
     words = answer["text"].splitlines()
     assert words[0] == "sets taken as equally probable: rub; or drag"
     assert best["sentence"] in words[1]
-    assert words[-1].startswith(f"Run next: {best['protocol']}.")
+    assert words[-2].startswith(f"Run next: {best['protocol']}.")
+    assert words[-1] == f"report: {diagnosed.folder.with_name('report.html')}"
     corners = np.loadtxt(diagnosed.folder / "next.csv", delimiter=",", skiprows=1)
     assert corners[-1, 0] == pytest.approx(best["seconds"], abs=1e-3)
     assert corners[:, 1].max() == pytest.approx(1e3 * max(c["reach_m"] for c in best["cycles"]), abs=1e-3)

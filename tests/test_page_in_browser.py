@@ -13,7 +13,8 @@ from toys.finished_run import facts
 from bayeskin.report.page import render_page
 from bayeskin.report.page.figures import FIGURES
 
-CHARTS = ["history", "residual", "indices-prior-gp"]
+CHARTS = ["overview-wide", "history", "residual", "indices-prior-gp"]
+SHOWN = "[...document.querySelectorAll('figure')].filter((f) => getComputedStyle(f).display !== 'none')"
 UNFOLD = "document.querySelectorAll('details').forEach((d) => { d.open = true; })"
 SCROLLED_WIDTH = "document.documentElement.scrollWidth"
 
@@ -32,7 +33,8 @@ def test_the_page_fits_its_width_and_a_browser_has_nothing_to_complain_of(
     shown.open(page, width, scheme)
     assert shown.ask("innerWidth") == width
     assert shown.ask(SCROLLED_WIDTH) <= width
-    drawn = shown.ask("[...document.querySelectorAll('figure svg')].map((s) => [s.id, s.clientHeight])")
+    drawn = shown.ask(f"{SHOWN}.map((f) => f.querySelector('svg')).map((s) => [s.id, s.clientHeight])")
+    assert drawn[0][0] == ("overview-narrow" if width == 390 else "overview-wide")
     assert len(drawn) == len(FIGURES) + len(CHARTS)
     assert [key for key, height in drawn if height < 50] == []
     ink, paper = (
@@ -88,10 +90,11 @@ def test_a_chart_is_read_by_pointer_and_keys_where_it_stands_and_enlarged(
 
 def test_every_figure_is_enlarged_and_comes_back(shown: Browser, page: Path) -> None:
     shown.open(page, 1280)
-    said = shown.ask("""(async () => {
+    said = shown.ask(
+        """(async () => {
       const told = [];
       const large = document.getElementById("large");
-      for (const figure of document.querySelectorAll("figure")) {
+      for (const figure of SHOWN) {
         const svg = figure.querySelector("svg");
         const before = svg.clientWidth;
         figure.querySelector(".enlarge").click();
@@ -102,7 +105,8 @@ def test_every_figure_is_enlarged_and_comes_back(shown: Browser, page: Path) -> 
         told.push([svg.id, wider, figure.firstElementChild.contains(svg)]);
       }
       return told;
-    })()""")
+    })()""".replace("SHOWN", SHOWN)
+    )
     assert len(said) == len(FIGURES) + len(CHARTS)
     assert [key for key, wider, back in said if not (wider and back)] == []
 
@@ -120,3 +124,18 @@ def test_paper_shows_what_is_folded_and_nothing_to_click(shown: Browser, page: P
     assert shown.ask("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     assert shown.ask(SCROLLED_WIDTH) <= 700
     assert shown.complaints == []
+
+
+def test_the_first_screen_holds_the_verdict_the_figure_and_three_sentences(
+    shown: Browser, page: Path
+) -> None:
+    for width, height, least in ((1280, 800, 250), (390, 844, 200)):
+        shown.open(page, width)
+        figure = shown.ask(f"{SHOWN}[0].querySelector('svg').clientHeight")
+        assert figure >= least
+        end = shown.ask("document.querySelector('.conclusion').getBoundingClientRect().bottom")
+        assert end < height
+        next_top = shown.ask(
+            "document.querySelector('.conclusion').nextElementSibling.getBoundingClientRect().top"
+        )
+        assert next_top > end

@@ -68,7 +68,7 @@ def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(concealed_
         "        raise PermissionError(arguments[0])\n"
         "sys.addaudithook(refuse)\n"
         "from pathlib import Path\n"
-        "from bayeskin.workflow import diagnosis\n"
+        "from bayeskin.workflow import diagnosing\n"
         "from bayeskin.recordings import read_recording, segment\n"
         f"assert len(segment(read_recording(Path({str(recording)!r})))) == 14\n"
         "assert not [name for name in sys.modules if name.startswith('bayeskin.proof')]\n"
@@ -80,7 +80,7 @@ def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(concealed_
 
 
 def test_what_diagnoses_mentions_neither_proof_nor_seals() -> None:
-    for path in [*(PACKAGE / "mismatch").rglob("*.py"), *(PACKAGE / "workflow").glob("diagnosis*.py")]:
+    for path in [*(PACKAGE / "mismatch").rglob("*.py"), *(PACKAGE / "workflow").glob("diagnos*.py")]:
         tree = ast.parse(path.read_text())
         words = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         words |= {

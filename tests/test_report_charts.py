@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
-from toys.finished_run import HISTORY, INDICES, summaries
+from toys.finished_run import FORCES, HISTORY, INDICES, facts, summaries
 
 from bayeskin.number_format import interval, number, quantity
+from bayeskin.report.page import StageFacts
 from bayeskin.report.page.charts import history_chart, indices_chart, residual_chart
+from bayeskin.report.page.overview import overview_charts
+from bayeskin.report.page.parts import Chart
 from bayeskin.report.page.prose import prose
 
 PHASES = summaries()["recording"]["phases"]
@@ -88,3 +92,46 @@ def test_an_interval_has_one_unit_unless_its_ends_are_far_apart() -> None:
     assert interval(1e4, 2e6, "Pa") == "10 kPa to 2 MPa"
     assert interval(-670.0, 2144.0, "Pa") == "−0.67 to 2.14 kPa"
     assert number(float("nan")) == "–"
+
+
+def overview(**changed: object) -> list[Chart]:
+    return overview_charts(facts(forces=[{**FORCES[0], **changed}]))
+
+
+def test_the_first_figure_of_a_diagnosis_is_drawn_for_two_widths_and_marks_the_mismatch() -> None:
+    wide, narrow = overview()
+    assert (wide.screen, narrow.screen) == ("wide", "narrow")
+    assert 'viewBox="0 0 380 ' in narrow.svg
+    for chart in (wide, narrow):
+        assert chart.svg.count('class="window"') == 2  # of the force and of the residual
+        assert chart.data["says"][1] == (
+            "0.75 s, load of cycle 1: recorded 100 mN; model before 180 mN, after 110 mN"
+        )
+        before, after, left_before, left_after = chart.data["dots"]
+        assert before[1] < after[1]  # more force stands higher
+        assert left_before[1] > left_after[1]  # and a recording below the model lower
+        assert max(before) < min(y for y in left_before if y is not None)
+        assert "at most 80 mN before and 10 mN after. Marked: 0.5 to 1.5 s." in chart.alt
+        assert "nan" not in chart.svg
+        json.dumps(chart.data, allow_nan=False)
+
+
+def test_a_smaller_mismatch_is_marked_fainter_and_none_is_not_in_the_legend() -> None:
+    first = FORCES[0]["windows"][0]
+    both = overview(windows=[first, {"start_s": 1.5, "end_s": 1.75, "mean_n": 0.02}])[0]
+    assert re.findall(r'class="window"[^>]*fill-opacity="([\d.]+)"', both.svg) == ["0.44", "0.44"]
+    assert [key.mark for key in both.keys][-1] == "window"
+    none = overview(windows=[])[0]
+    assert [key.mark for key in none.keys] == ["dots", "before", "line"]
+    assert none.alt.endswith("No window is marked.")
+
+
+def test_of_several_recordings_the_one_with_the_largest_mismatch_is_shown() -> None:
+    small = {**FORCES[0], "name": "first", "windows": [{"start_s": 0.0, "end_s": 1.0, "mean_n": 0.02}]}
+    large = {**FORCES[0], "name": "second"}
+    recording = {**summaries()["recording"], "recordings": [{"phases": ()}, {"phases": PHASES}]}
+    stages = {**facts().stages, "recording": StageFacts("recording", "done", 1.0, recording)}
+    chart = overview_charts(facts(forces=[small, large], stages=stages))[0]
+    assert chart.title.endswith("(recording second)")
+    assert chart.data["says"][0].startswith("0.25 s, load of cycle 1: ")
+    assert overview_charts(facts(forces=[])) == []

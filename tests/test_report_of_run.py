@@ -6,10 +6,14 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from toys.finished_run import HISTORY, drawing, summaries
+import numpy as np
+import pytest
+from toys.finished_run import FORCES, HISTORY, drawing, summaries
 
+from bayeskin import storage
 from bayeskin.report.page.figures import FIGURES
-from bayeskin.workflow import folder, page, stages
+from bayeskin.types import Recording
+from bayeskin.workflow import diagnosing, diagnosis, folder, page, stages
 from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage
 
 CONFIG = 'seed = {seed}\n[recording]\nfile = "r.csv"\n'
@@ -27,6 +31,8 @@ def stubs(fails: str = "") -> dict[str, Stage]:
                     run.at(name, f"{figure}.svg").write_text(drawing(figure))
             if name == "sample":
                 folder.write_json(run.at(name, "bands.json"), HISTORY)
+            if name == "diagnose":
+                folder.write_json(run.at(name, "forces.json"), FORCES)
             return summaries().get(name, {})
 
         return work
@@ -54,6 +60,31 @@ def test_a_run_ends_with_its_page_and_report_makes_it_again(tmp_path: Path) -> N
     again = stages.report(config, Silent(), stubs())
     assert (again["ok"], again["page"]) == (True, str(path))
     assert path.read_bytes() == first
+
+
+def test_a_diagnosis_ends_with_its_page_also_without_a_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    u_m = np.interp(time_s, [0.0, 5.0, 9.0, 30.0, 34.0, 60.0], [0.0, 0.0, 3e-3, 3e-3, 6e-3, 6e-3])
+    storage.save(tmp_path / "arm.h5", Recording(time_s, u_m, 30.0 * u_m, "arm", "0" * 64))
+    own = {name: stage for name, stage in stubs().items() if name in ("recording", "diagnose")}
+    monkeypatch.setattr(diagnosis, "stages_of", lambda config: own)
+    said = diagnosing.diagnose([tmp_path / "arm.h5"], Silent())
+    path = tmp_path / "arm-diagnosis" / page.FILE
+    assert said["page"] == str(path)
+    assert f"report: {path}" in said["text"]
+    alone = path.read_text()
+    assert '<h1 id="question">The model lacks device-friction</h1>' in alone
+    assert "has not been run" not in alone
+    # With a configuration, the page also has the stages that were run before.
+    monkeypatch.setattr(stages, "stages_of", lambda config: stubs())
+    config = configured(tmp_path)
+    stages.run(config, None, Silent(), stubs())
+    diagnosing.diagnose([config], Silent())
+    both = (tmp_path / "case" / page.FILE).read_text()
+    assert "The model lacks device-friction</h1>" in both
+    assert 'id="sample-posterior"' in both
 
 
 def test_report_runs_nothing_and_names_what_is_missing(tmp_path: Path) -> None:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 from toys.finished_run import facts, summaries
 from toys.html_walk import Walk
 
+from bayeskin.report.conclusion import conclusion_of
 from bayeskin.report.page import RunFacts, StageFacts, render_page
 from bayeskin.report.page.answer import answer
 from bayeskin.report.page.figures import FIGURES, pictures
 
-SECTIONS = ["answer", "recording", "fit", "posterior", "sobol", "mismatch", "checks", "provenance"]
+SECTIONS = ["answer", "mismatch", "recording", "fit", "posterior", "sobol", "checks", "provenance"]
 
 
 @pytest.fixture(scope="module")
@@ -69,16 +72,44 @@ def test_every_section_figure_and_table_is_there(whole: str) -> None:
         assert mode in whole
 
 
-def test_the_answer_comes_first_and_says_what_how_sure_and_what_is_missing(whole: str) -> None:
+def test_a_diagnosis_s_page_begins_with_its_verdict_one_figure_and_three_sentences(whole: str) -> None:
+    conclusion = conclusion_of(summaries()["diagnose"], summaries()["experiment"])
+    start = whole[whole.index("<h1") : whole.index('<div class="conclusion">')]
+    assert f'<h1 id="question">{conclusion.verdict}</h1>' in start
+    assert re.findall(r'<figure class="(\w+)-screen">', start) == ["wide", "narrow"]
+    assert start.count("<figure") == 2
+    first = whole[whole.index('<div class="conclusion">') :]
+    assert re.findall(r"<p>(.*?)</p>", first[: first.index("</div>")]) == list(conclusion.sentences)
+    assert whole.count("<h1") == 1
+    assert re.sub(r"<[^>]*>", "", first)[:900].index("What is this skin made of?") > 0
+
+
+def test_a_calibration_follows_the_diagnosis_and_begins_the_page_without_one(whole: str) -> None:
     text = Walk(whole).text()
     for said in (
         "What is this skin made of?", "50.8 kPa", "13.9 to 87 kPa", "informed, at the prior's lower bound",
-        "How sure is that? trusted", "What is missing? named", "The slide rubs: 60 mN. (probability 0.98)",
-        "Probability of a smooth effect that is not in the catalogue: 0.07.",
-        "The RMSE is 80 mN without and 24.7 mN with", "form a ridge",
+        "How sure is that? trusted", "form a ridge",
     ):  # fmt: skip
         assert said in text, said
-    assert text.index("What is missing?") < text.index("Phases of the recording")
+    assert "What is missing?" not in text
+    stages = {name: stage for name, stage in facts().stages.items() if name != "diagnose"}
+    alone = render_page(dataclasses.replace(facts(), stages=stages, forces=()))
+    assert '<h1 id="question">What is this skin made of?</h1>' in alone
+    assert "What is missing? not known yet" in Walk(alone).text()
+    assert '<div class="conclusion">' not in alone
+
+
+def test_a_diagnosis_alone_has_no_sections_on_a_calibration() -> None:
+    run = facts(config_text="")
+    stages = {name: stage for name, stage in run.stages.items() if name in ("recording", "diagnose")}
+    page = render_page(dataclasses.replace(run, stages=stages, history=None, indices={}))
+    assert [anchor for anchor in Walk(page).values("id") if anchor in SECTIONS] == [
+        "answer", "mismatch", "recording", "provenance"
+    ]  # fmt: skip
+    text = Walk(page).text()
+    assert "has not been run" not in text
+    assert "What is this skin made of?" not in text
+    assert "The configuration file" not in text
 
 
 def test_what_the_fit_leaves_stands_among_the_checks(whole: str) -> None:
@@ -98,7 +129,6 @@ def diagnosed_as(changed: dict[str, object]) -> str:
 
 def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
     text = diagnosed_as({})
-    assert "The RMSE is 80 mN without and 24.7 mN with" in text
     assert "has an RMSE of 21.3 mN. The fitted model differs from it by 0.4 mN there." in text
     failed = diagnosed_as({"full_model": {"message": "the skin folds"}})
     assert "The full model fails at the best values: the skin folds" in failed
@@ -112,34 +142,6 @@ def test_each_of_several_recordings_stands_beside_the_others() -> None:
     ]})  # fmt: skip
     assert "second2 mN25.2contradicts them" in text.replace("\N{NO-BREAK SPACE}", " ")
     assert re.search(r"first alone informs E.*; without it, the intervals would be wider by .* 2\.5\.", text)
-
-
-@pytest.mark.parametrize(
-    ("verdict", "smooth", "word", "sentence"),
-    [
-        ("unknown", 0.9, "something outside the catalogue", "no mechanism is likely enough"),
-        ("unknown", 0.1, "something that several causes would explain", "no mechanism is likely enough"),
-        ("nothing-missing", 0.1, "nothing that could be named", "no physics that the model leaves out"),
-    ],
-)
-def test_what_is_missing_is_said_alike_in_a_word_and_a_sentence(
-    verdict: str, smooth: float, word: str, sentence: str
-) -> None:
-    text = diagnosed_as(
-        {"verdict": verdict, "best_set": ["pad-slip", "backlash"], "smooth_probability": smooth}
-    )
-    assert f"What is missing? {word}" in text
-    assert ("The best set of the catalogue is pad-slip, backlash" in text) == (verdict == "unknown")
-    faint = text.count("The model fits better with pad-slip, backlash")
-    assert faint == (2 if verdict == "nothing-missing" else 0)
-    assert sentence in text
-    assert f"Probability of a smooth effect that is not in the catalogue: {smooth}." in text
-
-
-def test_nothing_is_missing_where_no_set_fits_better() -> None:
-    text = diagnosed_as({"verdict": "nothing-missing", "best_set": []})
-    assert "What is missing? nothing The recording stays" in text
-    assert "fits better with" not in text
 
 
 def test_the_table_of_parameters_has_prior_interval_unit_and_sentence(whole: str) -> None:
@@ -237,3 +239,31 @@ def test_figures_of_further_recordings_follow_that_of_the_first() -> None:
     fits = pictures(both, "sample", ["fit"])
     assert [picture.title for picture in fits[1:]] == [f"{fits[0].title}, recording {n}" for n in (2, 10)]
     assert len(pictures(run, "sample", ["fit"])) == 1
+
+
+def test_markers_are_shown_with_their_noise_and_what_they_add(whole: str) -> None:
+    text = Walk(whole).text()
+    residual = (
+        "t 2 of 25 markers the skin moves otherwise than the model says (residual of 0.12 mm RMS at the"
+    )
+    assert [text.count(f"{start}{residual}") for start in ("A", "Before: a", "After: a")] == [1, 1, 1]
+    assert text.count("The noise of a marker's coordinate has an sd of 0.02 mm.") == 3
+    assert re.sub(r"\s", "", text).count("wouldbewiderbythesefactors:Ec4.5.") == 3
+    assert re.sub(r"\s", "", text).count("c36−12−0.30.1") == 3
+    assert "Before: at 2 of 25" not in diagnosed_as({"best_set": []})
+
+
+def test_a_page_without_markers_does_not_mention_them() -> None:
+    def bare(summary: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in summary.items() if key != "on_skin"}
+
+    run = facts()
+    fit = {when: bare(fit) for when, fit in summaries()["diagnose"]["fit"].items()}
+    said = {"sample": bare(summaries()["sample"]), "diagnose": {**summaries()["diagnose"], "fit": fit}}
+    changed = {
+        name: dataclasses.replace(run.stages[name], summary=summary, figures={})
+        for name, summary in said.items()
+    }
+    assert (
+        "arkers" not in Walk(render_page(dataclasses.replace(run, stages={**run.stages, **changed}))).text()
+    )

@@ -24,7 +24,7 @@ from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.inference import draws_of
 from bayeskin.types import PadMotion, Recording, Simulation
-from bayeskin.workflow import diagnosis
+from bayeskin.workflow import diagnosing
 
 mpl.use("Agg")
 ROOT = Path(__file__).parents[1]
@@ -136,7 +136,7 @@ def test_a_diagnosis_takes_the_posteriors_settings(
 ) -> None:
     asked: list[Path] = []
     monkeypatch.setattr(
-        diagnosis, "diagnose", lambda sources, reporter: asked.extend(sources) or {"ok": True}
+        diagnosing, "diagnose", lambda sources, reporter: asked.extend(sources) or {"ok": True}
     )
     assert bk.diagnose(said["recording"], said["stiff"], folder=tmp_path) == {"ok": True}
     config = load_config(asked[0])
@@ -163,10 +163,10 @@ def test_a_script_that_diagnoses_needs_no_guard(tmp_path: Path) -> None:
     (tmp_path / "unguarded.py").write_text(
         "import math, sys\n"
         "import bayeskin as bk\n"
-        "from bayeskin.workflow import diagnosis\n"
+        "from bayeskin.workflow import diagnosing\n"
         "from bayeskin.execution.local import run_parallel\n"
         "print('once')\n"
-        "diagnosis.diagnose = lambda source, reporter: dict(run_parallel(math.sqrt, [4.0], 1))\n"
+        "diagnosing.diagnose = lambda source, reporter: dict(run_parallel(math.sqrt, [4.0], 1))\n"
         f"print(bk.diagnose(bk.load_recording({str(ROOT / 'data' / 'demo.h5')!r})))\n"
         "print(sys.modules['__main__'].bk is bk)\n"
     )

@@ -227,6 +227,11 @@ def test_a_mechanism_that_stood_in_for_others_is_exchanged(searched: Searched) -
     tried = {names_of(task) for task in toy.tasks if isinstance(task, ScoreTestTask)}
     assert ("sensor-drift", "stiffness-drift") in tried
     assert ("force-offset", "sensor-drift") in tried
+    rests = {task.names: task for task in toy.tasks if isinstance(task, FitTask) and task.runs == 1}
+    assert set(rests) == {("force-offset",), ("stiffness-drift",)}
+    for names, rest in rests.items():  # at the tissue of both, not at the one that fits best without one
+        own, both = (fit.fit.theta["E_s"] for fit in (result.fits[names], result.best))
+        assert abs(rest.start["E_s"] - both) < 0.7 * abs(own - both)
 
 
 def key(task: Task) -> str:

@@ -65,6 +65,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, quickly: pytest.MonkeyPat
     path = small_study(folder)
     table_of(folder, (*ROWS, BROKEN))
     (folder / "rec" / "e-1.h5").write_bytes(b"damaged")
+    (folder / "rec" / "a-1-markers.h5").touch()
     inferred = list[str]()
 
     def interrupted(run: object) -> object:
@@ -117,6 +118,15 @@ def test_a_recording_that_fails_is_left_out_and_the_answer_says_so(finished: Pat
     assert f"left out: e-1: {answer['left_out']['e-1']}" in answer["text"]
     page = (finished.parent / "springs" / "report.html").read_text()
     assert "5 of 6 recordings enter; 1 is left out" in page
+
+
+def test_markers_of_a_recording_are_not_used_and_the_answer_says_so(finished: Path) -> None:
+    answer = answer_of(finished)
+    assert answer["markers_unused"] == ["a-1"]
+    said = "A study infers from the force alone, so it does not use the markers of a-1."
+    assert said in answer["text"]
+    assert said in (finished.parent / "springs" / "report.html").read_text()
+    assert "markers = " not in (finished.parent / "springs" / "recordings" / "a-1.toml").read_text()
 
 
 def test_the_page_opens_the_report_of_each_recording(finished: Path) -> None:
@@ -224,6 +234,7 @@ DEVICE = "[device]\ngauge_mm = 30.0\n"
         ({"table.csv": "none.csv"}, "", "none.csv: there is no such file"),
         ({"[fit]": '[recording]\nfile = "a.h5"\n[fit]'}, "", "the table names the recordings"),
         ({"[fit]": "recording = 3\n[fit]"}, "", "springs.toml: "),
+        ({"[fit]": '[recording]\nmarkers = "m.h5"\n[fit]'}, "", "recording.markers: a study infers from the"),
         ({"bin_width_s": "bin_width"}, "", "springs.toml: fit.bin_width: this key is not known"),
         ({"spring.py": "none.py"}, "", "none.py"),
         ({}, "rec/x.h5,ella,keloid\n", "'rec/x.h5': there is no such file"),

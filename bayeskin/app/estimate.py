@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
 from bayeskin.app.recordings import RecordingFolder
@@ -23,6 +23,9 @@ USUAL_S = {
 }
 SHIPPED_DESIGN_S = 1.0  # of a run with a shipped surrogate
 FULL_DESIGN_S = 1600.0  # of a design by the full model, 11 to 42 minutes
+# The time that a stage still takes may be shorter or longer by this factor. The search of a diagnosis has no
+# known length.
+UNSURE = {"diagnose": 2.0}
 OVERRUN = 0.5  # a stage that has taken longer than usual is expected to take this share of it once more
 
 
@@ -37,6 +40,18 @@ def usual_seconds(stage: str, config: Config, others: Iterable[RecordingFolder])
     records = (read_record(folder.run / stage) for folder in others)
     finished = [record.seconds for record in records if record is not None and record.done]
     return median(finished) if finished else USUAL_S[stage]
+
+
+def range_left(left_s: Mapping[str, float]) -> tuple[float, float]:
+    """Returns the shortest and the longest time that a job is expected to take still.
+
+    left_s : the time that each of its stages still takes, by the name of the stage
+    """
+    unsure = {stage: UNSURE.get(stage, 1.0) for stage in left_s}
+    shortest, longest = (
+        sum(seconds * unsure[stage] ** power for stage, seconds in left_s.items()) for power in (-1, 1)
+    )
+    return shortest, longest
 
 
 def seconds_left(so_far_s: float, usual_s: float, tasks_left_s: Sequence[float] = ()) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 from jinja2 import Environment
 
 from bayeskin.app import comparison, devices, jobs, reading
+from bayeskin.app.estimate import range_left
 from bayeskin.app.questions import MISSING, PREPARE, QUESTIONS
 from bayeskin.app.recordings import RecordingFolder, Recordings
 from bayeskin.app.steps import steps
@@ -21,13 +22,20 @@ from bayeskin.errors import InputError
 from bayeskin.number_format import number, percent
 from bayeskin.report.page.parts import Cell, Facts, Folded, Table, Text, row
 from bayeskin.report.page.render import page_environment
+from bayeskin.workflow.diagnosis_progress import LABEL as WHOLE_DIAGNOSIS
 from bayeskin.workflow.progress import TaskProgress
+from bayeskin.workflow.reducing import default_path, training_folder
 
 HERE = Path(__file__).parent
 _TITLES = {key: question.title for key, question in QUESTIONS.items()}
 _TONES = {jobs.State.DONE: "good", jobs.State.RUNNING: "none", jobs.State.STOPPED: "none"}
 _FINISHED = (jobs.State.DONE, jobs.State.NOT_TRUSTED)
-_PROBLEMS = ("reading", "device", "ask")  # the parts of a recording's page in which an error may stand
+_PROBLEMS = (
+    "reading",
+    "device",
+    "ask",
+    "remove",
+)  # the parts of a recording's page in which an error may stand
 
 
 @cache
@@ -42,7 +50,11 @@ def render(template: str, root: str, **parts: Any) -> str:
 
 def recordings_page(root: str, recordings: Recordings) -> str:
     """Returns the page with all recordings, and the place to drop a further one."""
-    rows = [(folder, _day(folder.dropped_s), jobs.job_of(folder.job)) for folder in recordings.all()]
+    rows = [
+        (folder, _day(folder.dropped_s), job, _share(job))
+        for folder in recordings.all()
+        for job in [jobs.job_of(folder.job)]
+    ]
     return render("recordings.html", root, rows=rows, titles=_TITLES, most_bytes=MOST_BYTES)
 
 
@@ -79,12 +91,12 @@ def job_page(root: str, recordings: Recordings, folder: RecordingFolder, job: jo
     now_s, lines = time.monotonic(), job.lines
     stages = steps(folder, job, [other for other in recordings.all() if other != folder])
     failed = any(step.state == "failed" for step in stages)
-    left_s = sum(step.left_s for step in stages)
+    left = _about(*range_left({step.name: step.left_s for step in stages}))
     return render(
         "job.html", root, folder=folder, job=job, question=QUESTIONS[job.question],
         word="failed" if failed else str(job.state), tone="doubt" if failed else _tone(job),
         goes_on=failed or job.state not in _FINISHED, refused=_refusal(job, lines), lines=lines,
-        so_far=_duration(job.seconds), left=_about(left_s) if job.running and stages else "",
+        so_far=_duration(job.seconds), left=left if job.running and stages else "",
         tasks=[_task(task, now_s) for task in job.tasks if job.running],
         steps=[{**asdict(step), "taken": _duration(step.seconds) if step.seconds else ""} for step in stages],
     )  # fmt: skip
@@ -149,7 +161,8 @@ def _columns(sheets: Sequence[reading.SheetPreview]) -> list[tuple[str, str]]:
 def _questions(folder: RecordingFolder, stated: bool) -> list[Any]:
     """Returns the questions that can be asked; a device without a reduced model can be prepared."""
     unprepared = stated and not devices.has_reduced_model(folder)
-    keys = [key for key in QUESTIONS if key != PREPARE.key or unprepared]
+    unfinished = unprepared or training_folder(default_path(folder.device)).is_dir()
+    keys = [key for key in QUESTIONS if key != PREPARE.key or unfinished]
     return [QUESTIONS[key] for key in keys if key != MISSING.key or not unprepared]
 
 
@@ -162,12 +175,18 @@ def _tone(job: jobs.Job) -> str:
     return _TONES.get(job.state, "doubt")
 
 
-def _about(seconds: float) -> str:
-    """Returns a rough duration in words."""
-    minutes = round(seconds / 60)
-    if minutes < 1:
+def _about(shortest_s: float, longest_s: float) -> str:
+    """Returns a rough duration, or a range of durations, in words."""
+    low, high = max(round(shortest_s / 60), 1), round(longest_s / 60)
+    if high < 1:
         return "less than a minute"
-    return f"about {minutes} minute{'s' * (minutes > 1)}"
+    return f"{low} to {high} minutes" if high > low else f"about {high} minute{'s' * (high > 1)}"
+
+
+def _share(job: jobs.Job | None) -> str:
+    """Returns the share of a running diagnosis that is done, and nothing for any other job."""
+    tasks = job.tasks if job is not None and job.running else []
+    return next((percent(task.share, 2) for task in tasks if task.label == WHOLE_DIAGNOSIS), "")
 
 
 def _refusal(job: jobs.Job, lines: Sequence[str]) -> str:
@@ -178,7 +197,7 @@ def _refusal(job: jobs.Job, lines: Sequence[str]) -> str:
 def _task(task: TaskProgress, now_s: float) -> dict[str, Any]:
     """Returns what a task's line shows."""
     left_s = task.left_s(now_s)
-    left = "" if left_s is None else f"{_duration(left_s)} left"
+    left = "" if left_s is None or task.label == WHOLE_DIAGNOSIS else f"{_duration(left_s)} left"
     return {**asdict(task), "percent": percent(task.share, 2), "left": left}
 
 

@@ -39,9 +39,10 @@ MISSING = Question(
 PREPARE = Question(
     "prepare",
     "Prepare this device",
-    "No reduced model for this device exists yet. It is built once, and makes both questions quick. "
+    "No complete reduced model for this device exists yet. It is built once, and makes both questions quick. "
     "The question of what is missing needs it.",
-    "It takes two to three hours. A first version can be used after about ten minutes.",
+    "It takes two to three hours. A first version can be used after about ten minutes: stop the job then, "
+    "ask, and go on with the preparation later.",
 )
 QUESTIONS = {question.key: question for question in (CALIBRATE, MISSING, PREPARE)}
 
@@ -80,6 +81,6 @@ def _commands(folder: RecordingFolder, key: str) -> Sequence[Sequence[str]]:
     config = folder.config.name
     return {
         CALIBRATE.key: [["run", config]],
-        MISSING.key: [["diagnose", config], ["report", config]],
+        MISSING.key: [["diagnose", config]],
         PREPARE.key: [["reduce", folder.device.name]],
     }[key]

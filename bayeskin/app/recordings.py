@@ -93,7 +93,7 @@ class Recordings:
     def named(self, name: str) -> RecordingFolder | None:
         """Returns the folder of a recording, or None for any name that no recording has."""
         path = self.root / name
-        return RecordingFolder(path) if _NAME.fullmatch(name) and _is_recording(path) else None
+        return RecordingFolder(path) if path.name == name and _is_recording(path) else None
 
     def new(self, file_name: str) -> RecordingFolder:
         """Makes the folder of a new recording, whose name is made from the name of its file.
@@ -126,4 +126,4 @@ def open_recordings(root: Path) -> Recordings:
 
 
 def _is_recording(path: Path) -> bool:
-    return path.is_dir() and not path.is_symlink() and (path / "original").is_dir()
+    return bool(_NAME.fullmatch(path.name)) and not path.is_symlink() and (path / "original").is_dir()

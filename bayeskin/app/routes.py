@@ -26,6 +26,7 @@ from bayeskin.app import devices, jobs, pages, questions, reading
 from bayeskin.app.access import COOKIE, ENTRANCE, Access
 from bayeskin.app.downloads import packed
 from bayeskin.app.recordings import RecordingFolder, Recordings
+from bayeskin.app.removal import remove
 from bayeskin.app.uploads import receive
 from bayeskin.errors import InputError
 from bayeskin.report.page.render import page_asset
@@ -63,6 +64,7 @@ class Routes:
             Route(f"{at}/device", self.state_device, methods=["POST"]),
             Route(f"{at}/ask/{{question}}", self.ask, methods=["POST"]),
             Route(f"{at}/stop", self.stop, methods=["POST"]),
+            Route(f"{at}/remove", self.remove, methods=["POST"]),
             Route(f"{at}/job", self.job),
             Route(f"{at}/report", self.report),
             Route(f"{at}/download", self.download),
@@ -127,7 +129,7 @@ class Routes:
         def change(folder: RecordingFolder, form: dict[str, str]) -> str:
             questions.refuse_running(folder)
             reading.read_as(folder, reading.Choice.from_form(form))
-            return "#read"
+            return f"{_at(folder)}#read"
 
         return await self._changed(request, "reading", change)
 
@@ -140,7 +142,7 @@ class Routes:
                 devices.state_as(folder, self._named(form["as"]))
             else:
                 devices.state(folder, devices.from_form(form))
-            return "#ask"
+            return f"{_at(folder)}#ask"
 
         return await self._changed(request, "device", change)
 
@@ -149,7 +151,7 @@ class Routes:
 
         def change(folder: RecordingFolder, form: dict[str, str]) -> str:
             questions.ask(folder, request.path_params["question"])
-            return "/job"
+            return f"{_at(folder)}/job"
 
         return await self._changed(request, "ask", change)
 
@@ -158,9 +160,18 @@ class Routes:
 
         def change(folder: RecordingFolder, form: dict[str, str]) -> str:
             jobs.stop(folder.job)
-            return "/job"
+            return f"{_at(folder)}/job"
 
         return await self._changed(request, "ask", change)
+
+    async def remove(self, request: Request) -> Response:
+        """Removes a recording, and shows the others."""
+
+        def change(folder: RecordingFolder, form: dict[str, str]) -> str:
+            remove(folder, form)
+            return "/"
+
+        return await self._changed(request, "remove", change)
 
     def job(self, request: Request) -> Response:
         """Shows the last job of a recording."""
@@ -200,7 +211,7 @@ class Routes:
         return folder
 
     async def _changed(self, request: Request, part: str, change: Change) -> Response:
-        """Makes a change of a recording and leads on to where its result stands.
+        """Makes a change of a recording, and leads on to the path that it returns.
 
         A wrong input is shown in a `part` of the recording's page, and changes nothing.
         """
@@ -214,9 +225,14 @@ class Routes:
                     problems = {part: str(error)}
                     text = pages.recording_page(self.access.root, self.recordings, folder, problems)
                     return HTMLResponse(text, status_code=400)
-            return RedirectResponse(f"{self.access.root}/recordings/{folder.name}{at}", status_code=303)
+            return RedirectResponse(f"{self.access.root}{at}", status_code=303)
 
         return await run_in_threadpool(answer)
+
+
+def _at(folder: RecordingFolder) -> str:
+    """Returns the path of a recording's page, below the page's root."""
+    return f"/recordings/{folder.name}"
 
 
 async def _form(request: Request) -> dict[str, str]:

@@ -12,6 +12,7 @@ from bayeskin.app.jobs import Job
 from bayeskin.app.questions import CALIBRATE, PREPARE
 from bayeskin.app.recordings import RecordingFolder
 from bayeskin.workflow.diagnosis import stages_of as stages_of_diagnosis
+from bayeskin.workflow.diagnosis_progress import LABEL as WHOLE_DIAGNOSIS
 from bayeskin.workflow.engine import Run, Silent, Stage, open_run, standing
 from bayeskin.workflow.folder import RECORD, Record
 from bayeskin.workflow.stages import stages_of
@@ -72,8 +73,9 @@ def _step(
     if record is not None and stands == "not finished":  # its record was written when it began
         seconds = record.seconds + _age_s(run.folder / stage.name / RECORD)
     now_s = time.monotonic()
-    tasks_left_s = [left_s for task in job.tasks if (left_s := task.left_s(now_s)) is not None]
-    return Step(stage.name, stage.does, "working", seconds, seconds_left(seconds, usual_s, tasks_left_s))
+    tasks_left_s = {task.label: left_s for task in job.tasks if (left_s := task.left_s(now_s)) is not None}
+    left_s = tasks_left_s.get(WHOLE_DIAGNOSIS, seconds_left(seconds, usual_s, list(tasks_left_s.values())))
+    return Step(stage.name, stage.does, "working", seconds, left_s)
 
 
 def _age_s(file: Path) -> float:

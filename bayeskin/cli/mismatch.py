@@ -28,7 +28,8 @@ def diagnose(sources: tuple[Path, ...], device: Path | None) -> Mapping[str, Any
     result. The likeliest sets are fitted again to the recording up to the end of its second hold, and tested
     on the rest of it. This takes two to ten minutes, and longer if many mechanisms act. For the article's
     observation, and for a forward model of your own, a surrogate is trained first, and mechanisms of the
-    tissue are not tried. The exit code is 0 for every verdict.
+    tissue are not tried. The exit code is 0 for every verdict. Read report.html in the run's folder for the
+    result: it begins with the verdict, one figure and three sentences.
 
     \b
     Example:
@@ -37,10 +38,10 @@ def diagnose(sources: tuple[Path, ...], device: Path | None) -> Mapping[str, Any
       bayeskin diagnose first.h5 --device device.toml
       bayeskin diagnose first.h5 second.h5
     """
-    from bayeskin.workflow import diagnosis
+    from bayeskin.workflow import diagnosing
 
     with Terminal() as terminal:
-        return diagnosis.diagnose(sources, terminal, device)
+        return diagnosing.diagnose(sources, terminal, device)
 
 
 @click.command(short_help="Propose a test that tells look-alike mechanisms apart.")

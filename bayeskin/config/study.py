@@ -102,6 +102,12 @@ def load_study(path: Path | str) -> StudyFile:
             f"{named!r:.80} is not a section",
             "write a section [recording], or leave it out",
         )
+    if "markers" in named:
+        raise InputError(
+            f"{path}: recording.markers",
+            "a study infers from the force alone",
+            "leave out this key, or run the recording by itself",
+        )
     config = config_of({**settings, "recording": {**named, "file": table}}, path)
     return StudyFile(path, path.parent / table, settings, config)
 

@@ -121,7 +121,9 @@ def assess(context: DiagnosisContext, explanation: Explanation) -> Diagnosis:
         before = _assessed(base, best, draws_near_run(base, seed), base_beginning, seed, motion)
     else:  # both are fits of the base model, whose posterior has been sampled already
         located = _located(base, best, seed)
-        before = replace(after, fit=base, located=located, on_skin=on_skin(base, motion))
+        before = replace(
+            after, fit=base, located=located, on_skin=on_skin(base.log_posterior, base.theta, motion)
+        )
     return Diagnosis(
         explanation, before, after,
         contributions(explanation.best, best.theta, context.reported, context.known),
@@ -136,7 +138,8 @@ def _assessed(
     """Returns an assessed fit; its noise is that of the best fit, which takes no mismatch for noise."""
     draws = inference.evenly(drawn.draws, PREDICTIVE_DRAWS)
     band_n = inference.bands(fit.log_posterior, draws, np.random.default_rng(1)).interval(0.9)
-    return AssessedFit(fit, drawn, band_n, _located(fit, best, seed), beginning, on_skin(fit, motion))
+    skin = on_skin(fit.log_posterior, fit.theta, motion)
+    return AssessedFit(fit, drawn, band_n, _located(fit, best, seed), beginning, skin)
 
 
 def _located(fit: Fit, best: Fit, seed: int) -> Located:

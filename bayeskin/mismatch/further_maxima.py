@@ -1,9 +1,9 @@
-"""Finds further maxima of the posterior of the most probable set, from values that the force hardly informs.
+"""Finds further maxima of the posterior of the most probable sets, from values that the force hardly informs.
 
 A posterior often has several maxima whose forces hardly differ. The force hardly shows which of the layers
 drains during the test, and whether the other layer drains at once or not at all. Intervals that ignore the
-further maxima are too narrow. Besides, a mechanism may have gained only because the smaller set was not at
-its highest maximum.
+further maxima are too narrow. Besides, a set may be likelier than its rivals only because they were not at
+their highest maxima.
 """
 
 from __future__ import annotations
@@ -31,19 +31,31 @@ from bayeskin.types import ParameterSpace
 
 
 def find_further_maxima(context: SearchContext, weigh: Callable[[], None]) -> None:
-    """Records further maxima of the likeliest subset of the most probable set, then those of this set.
+    """Records further maxima of the rivals of the most probable set, then those of this set.
 
     weigh : compares the hypotheses again after a fit has changed
     """
-    record = context.record
-    family, names = record.family, record.chosen
-    behind = {subset: family.likeliest(names) - family.likeliest(subset) for subset in record.evidences}
-    subsets = [
-        subset for subset in behind if set(subset) < set(names) and behind[subset] < context.settings.behind
-    ]
-    if subsets:
-        _record_maxima(context, min(subsets, key=lambda subset: behind[subset]), weigh)
-    _record_maxima(context, record.chosen, weigh)
+    for rival in rivals(context, context.settings.rival):
+        _record_maxima(context, rival, weigh)
+    _record_maxima(context, context.record.chosen, weigh)
+
+
+def rivals(context: SearchContext, behind: float) -> list[Names]:
+    """Returns the sets that could become as likely as the most probable set, the likeliest first.
+
+    A set that contains one of the others is no rival: `fit_larger_sets` fits it again from their new maxima.
+    The set without mechanisms has no rivals, because all other sets contain it.
+
+    behind : largest difference in log-probability from the most probable set
+    """
+    record, family = context.record, context.record.family
+    if not record.chosen:
+        return []
+    sets = sorted((names for names in record.evidences if names), key=lambda names: -family.likeliest(names))
+    least = family.likeliest(record.chosen) - behind
+    near = [names for names in sets if family.likeliest(names) > least]
+    smallest = [names for names in near if not any(set(other) < set(names) for other in near)]
+    return [names for names in smallest if names != record.chosen]
 
 
 def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], None]) -> None:
@@ -79,9 +91,9 @@ def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], Non
 
 
 def fit_larger_sets(context: SearchContext, best: SetFit) -> None:
-    """Repeats the fits of the compared sets that contain a set, from this set's new maximum."""
+    """Repeats the fits of the sets that contain a set, from this set's new maximum."""
     record = context.record
-    larger = [names for names in record.evidences if set(best.fit.names) < set(names)]
+    larger = [names for names in record.fits if set(best.fit.names) < set(names)]
     starts = [{**record.fits[names].fit.theta, **best.fit.theta} for names in larger]
     runs, correction_n = context.settings.runs, correction(best)
     climbs = [FitTask(names, start, runs, correction_n) for names, start in zip(larger, starts, strict=True)]

@@ -3,8 +3,10 @@
 A hypothesis is a set of mechanisms, with or without an unnamed smooth discrepancy (a Gaussian process,
 `discrepancy`). Every mechanism has the same prior probability, and the discrepancy has it, too. The evidence
 of every hypothesis takes the force as linear near the set's fit, and uses the measured noise
-(`Unexplained.log_evidence`). A probability is a share of the weights of all hypotheses that were compared;
-sets that were never fitted do not count.
+(`Unexplained.log_evidence`). This evidence has an error: the posterior is curved, and the fit may have ended
+at a lower maximum of it. Each mechanism is taken to add an independent normal error to the log-evidences of
+all sets that contain it. A probability is a share of the weights of all hypotheses that were compared,
+averaged over these errors. Sets that were never fitted do not count.
 
 A mechanism is named if its probability is at least 0.9. It is also named if its group of look-alikes has this
 probability together, and it is the likeliest of the group. There is an exception: nothing is named where the
@@ -18,12 +20,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.stats import norm, qmc
 
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
+from bayeskin.types import Array
+
+ERRORS = 1024  # number of draws of the evidences' errors, a power of two
 
 
 @dataclass(frozen=True)
@@ -35,6 +42,7 @@ class VerdictSettings:
     likelier_than_not : probability from which a discrepancy, or that nothing is missing, is likelier than not
     most_of_it : share of the squared misfit that named mechanisms must explain where a discrepancy is
         likelier than not
+    evidence_sd : sd of the error that each mechanism of a set adds to its log-evidence [nats]
     `benchmarks/diagnosis_scoreboard.py` shows which verdicts other values would give.
     """
 
@@ -42,6 +50,7 @@ class VerdictSettings:
     probable: float = 0.9
     likelier_than_not: float = 0.5
     most_of_it: float = 0.9
+    evidence_sd: float = 3.0
 
     @property
     def log_odds(self) -> float:
@@ -112,9 +121,13 @@ def hypotheses_of(
 
 @dataclass(frozen=True)
 class Family:
-    """All hypotheses that are compared."""
+    """All hypotheses that are compared.
+
+    evidence_sd : sd of the error that each mechanism of a set adds to its log-evidence [nats]
+    """
 
     hypotheses: Sequence[Hypothesis]
+    evidence_sd: float = VerdictSettings().evidence_sd
 
     def probability(self, names: Collection[str]) -> float:
         """Returns the probability that at least one of these mechanisms acts."""
@@ -139,10 +152,22 @@ class Family:
         return self._share([not hypothesis.names and not hypothesis.smooth for hypothesis in self.hypotheses])
 
     def _share(self, among: Sequence[bool]) -> float:
-        """Returns the share of the weight that some of the hypotheses have."""
+        """Returns the probability that some of the hypotheses have together."""
+        return float(self._probabilities[np.array(among)].sum())
+
+    @cached_property
+    def _probabilities(self) -> Array:
+        """Returns the probability (h,) of each hypothesis, as the mean over errors of the evidences."""
         log_weights = np.array([hypothesis.log_weight for hypothesis in self.hypotheses])
-        share = np.exp(log_weights - log_weights.max())
-        return float(share[np.array(among)].sum() / share.sum())
+        names = sorted({name for hypothesis in self.hypotheses for name in hypothesis.names})
+        if names:
+            errors = self.evidence_sd * norm.ppf(qmc.Sobol(len(names), rng=0).random(ERRORS))
+            acts = np.array([[name in h.names for name in names] for h in self.hypotheses], dtype=float)
+            log_weights = log_weights + errors @ acts.T
+        else:
+            log_weights = log_weights[None]
+        weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+        return np.asarray((weights / weights.sum(axis=1, keepdims=True)).mean(axis=0))
 
 
 def judge_family(

@@ -9,14 +9,15 @@ lacks.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import MARKER_SD
-from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, PadMotion
 
 LEVEL = 0.05  # probability that noise alone makes any point significant
@@ -49,14 +50,14 @@ class OnSkin:
         return float(np.sqrt(np.mean(np.sum(self.vector_m**2, axis=1))))
 
 
-def on_skin(fit: Fit, motion: PadMotion) -> OnSkin | None:
-    """Returns the residuals of a fit on the skin, or None for a recording without markers."""
-    likelihood = fit.log_posterior.markers
+def on_skin(log_posterior: LogPosterior, theta: Mapping[str, float], motion: PadMotion) -> OnSkin | None:
+    """Returns the residuals on the skin at values of all parameters, or None without markers."""
+    likelihood = log_posterior.markers
     if likelihood is None:
         return None
-    theta = np.array([[fit.theta[name] for name in fit.log_posterior.names]])
-    predicted_m = fit.log_posterior.predict_markers(theta)[0]
-    residual_m = likelihood.without_camera(predicted_m, fit.theta[MARKER_SD])
+    values = np.array([[theta[name] for name in log_posterior.names]])
+    predicted_m = log_posterior.predict_markers(values)[0]
+    residual_m = likelihood.without_camera(predicted_m, theta[MARKER_SD])
     markers = likelihood.markers
     opening_m = motion.at(markers.time_s) - motion.at(markers.time_s[0])
     share = opening_m[1:] / opening_m[int(np.argmax(np.abs(opening_m)))]

@@ -5,11 +5,15 @@ could be added to the current set (`candidates`). The most promising ones are fi
 parameters free again. The set with the largest weight becomes the current set if it gains weight. A missing
 mechanism biases the tissue's parameters, so the sets that gain most are also fitted from other tissues. Then
 each mechanism of the best set is left out in turn. Where nothing gains any more, each mechanism of the best
-set is exchanged: it is left out, and every other mechanism is added to the remaining ones.
+set, or of its smallest likely part, is exchanged: it is left out, and every other mechanism is added to the
+remaining ones, at the tissue of this set.
 
 A mechanism that is not in the catalogue is imitated by several mechanisms of the catalogue, and each of these
 gains. The search therefore continues from a larger set only if one of its two hypotheses, alone or with an
 unnamed smooth discrepancy, is likelier than both hypotheses of the smaller set.
+
+At the end, higher maxima are searched for the sets that could become as likely as the most probable one, and
+mechanisms are added to those that are nearly as likely (`further_maxima`).
 
 Runs of the full model check a fit before the search continues from its set, and all likely sets at the end
 (`full_checks`). The weight of a set is its evidence times the prior odds of its mechanisms.
@@ -25,7 +29,7 @@ from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, without_one
 from bayeskin.mismatch.candidates import Candidates
 from bayeskin.mismatch.full_checks import check, check_likely_sets, checked_best, is_checked_nearby
-from bayeskin.mismatch.further_maxima import find_further_maxima
+from bayeskin.mismatch.further_maxima import find_further_maxima, rivals
 from bayeskin.mismatch.hypotheses import Evidences, weight
 from bayeskin.mismatch.search_context import SearchContext, Tell, correction, gained, title
 from bayeskin.mismatch.search_record import Names, SearchResult
@@ -56,6 +60,8 @@ def search(
     searcher.weigh_likely_sets()
     if context.record.evidences:
         find_further_maxima(context, searcher.weigh_likely_sets)
+        if searcher.search_beside_rivals():
+            find_further_maxima(context, searcher.weigh_likely_sets)
     return context.record.result()
 
 
@@ -67,6 +73,7 @@ class Searcher:
         self._candidates = Candidates(context)
         self._tissues: list[dict[str, float]] = []
         self._weighed: dict[Names, SetFit] = {}  # the fit to which each evidence belongs
+        self._exchanged: set[Names] = set()  # sets whose mechanisms were replaced by others
 
     def fit_base_model(self) -> None:
         """Fits the model without mechanisms. Raises InputError where no tissue of the priors runs."""
@@ -115,6 +122,21 @@ class Searcher:
             names = record.chosen
             check(self._context, [record.fits[names]])
             self._weigh([names])
+
+    def search_beside_rivals(self) -> bool:
+        """Adds mechanisms to the rivals of the most probable set; returns whether there was one to add to.
+
+        The search adds mechanisms to the likeliest set only. Where another set is nearly as likely, its
+        larger sets must be compared too; otherwise the likeliest set would gain by their absence.
+        """
+        context, expanded = self._context, self._candidates.expanded
+        new = [names for names in rivals(context, context.settings.close) if names not in expanded]
+        for names in new:
+            self._candidates.fit_beside(context.record.fits[names])
+        if new:
+            check_likely_sets(context)
+            self.weigh_likely_sets()
+        return bool(new)
 
     def _weigh(self, sets: Iterable[Names]) -> None:
         """Computes the evidences of sets that are new or whose fit has changed.
@@ -194,13 +216,34 @@ class Searcher:
         return [fit for fit in fits[: settings.alike] if gained(fit, current) >= least]
 
     def _exchange(self, current: SetFit) -> None:
-        """Fits sets in which each mechanism of the current set is replaced by another one."""
-        context, names = self._context, current.fit.names
-        if len(names) > 1:
-            for name in names:
-                smaller = context.record.fits.get(without_one(names, name, context.known))
-                if smaller is not None and smaller.fit.names not in self._candidates.expanded:
-                    self._candidates.fit_beside(smaller)
+        """Fits sets in which each mechanism of the smallest likely part of a set is replaced by another one.
+
+        The tests of the other mechanisms use the tissue of this part. The tissue that fits best without the
+        mechanism is biased, and at this tissue the tests may promise hardly any gain.
+        """
+        context, part = self._context, self._smallest_part(current)
+        names = part.fit.names
+        if names in self._exchanged:
+            return
+        self._exchanged.add(names)
+        smaller_sets = dict.fromkeys(without_one(names, name, context.known) for name in names)
+        for smaller in smaller_sets:
+            correction_n = correction(part) if context.solved(smaller) == context.solved(names) else ()
+            (at_tissue,) = context.ask([FitTask(smaller, part.fit.theta, 1, correction_n)])
+            if isinstance(at_tissue, SetFit):
+                self._candidates.fit_beside(at_tissue)
+
+    def _smallest_part(self, current: SetFit) -> SetFit:
+        """Returns the fit of the set with the fewest mechanisms among the likely parts of a set.
+
+        The set itself is one of its parts. Of several sets with as few mechanisms it is the likeliest.
+        """
+        parts = [
+            fit for names, fit in self._context.record.fits.items()
+            if names and set(names) <= set(current.fit.names)
+            and gained(current, fit) <= self._context.settings.close
+        ]  # fmt: skip
+        return min(parts, key=lambda fit: (len(fit.fit.names), -weight(fit.fit)), default=current)
 
     def _fit_from_other_tissues(self, current: SetFit) -> None:
         """Fits a set again from other tissues, with the present values of its mechanisms."""

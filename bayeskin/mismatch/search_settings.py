@@ -37,12 +37,13 @@ class SearchSettings:
     left : RMS residual, divided by the RMS noise, from which more than noise is left
 
     Checks by the full model
-    close : largest difference in weight from the best set with which a set is checked
+    close : largest difference in weight from the best set with which a set is checked, or counts as likely
     compared, checks : largest number of sets that are checked in a round, and of rounds
     weighed : number of sets whose hypotheses are compared
     exact : largest error of the forward model that needs no correction, RMS over bins, divided by the noise
 
     Further maxima
+    rival : difference in log-probability from the most probable set, up to which a set could become as likely
     shapes : number of shapes of each part of a mechanism from which further maxima are searched for
     ends, ratios : positions of a permeability in its prior, and ratios of the moduli, from which fits start
     maxima : largest number of further maxima that are kept
@@ -73,6 +74,7 @@ class SearchSettings:
     checks: int = 4
     weighed: int = 6
     exact: float = 0.05
+    rival: float = 20.0
     shapes: int = 2
     ends: tuple[float, float] = (0.1, 0.9)
     ratios: tuple[float, ...] = (0.05, 0.2, 0.6, 1.5)

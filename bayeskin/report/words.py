@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayeskin.inference.identify import Informed, grade_of
@@ -24,18 +24,28 @@ def polished_in_words(polished: Mapping[str, Any] | None) -> list[str]:
     return [f"Refined with the full model: {number(polished['gained'])} nats gained, {polished['message']}."]
 
 
-def faint_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
-    """Returns a sentence about the mechanisms that improve the fit although none could be named.
-
-    There is no sentence where the verdict is another, or where no set fits better.
-    """
-    if diagnosis["verdict"] != "nothing-missing" or not diagnosis["best_set"]:
-        return []
-    better = ", ".join(diagnosis["best_set"])
+def markers_in_words(on_skin: Mapping[str, Any]) -> list[str]:
+    """Returns sentences about the markers of a fit: their residuals, their noise, and what they add."""
+    count, total = on_skin["significant"], on_skin["points"]
+    where = (
+        f"At {count} of {total} markers the skin moves otherwise than the model says"
+        if count
+        else f"All {total} markers move as the model says"
+    )
+    rms, sd = (f"{number(1e3 * on_skin[key], 2)} mm" for key in ("rms_m", "sd_m"))
+    adds = [f"{name} {number(factor, 2)}" for name, factor in on_skin["widens"].items() if factor >= ADDS]
+    wider = f"would be wider by these factors: {', '.join(adds)}" if adds else "would hardly be wider"
     return [
-        f"The model fits better with {better}, but too little or too uncertainly to name it. The skin's "
-        "parameters depend on whether it acts, so do not rely on them."
+        f"{where} (residual of {rms} RMS at the largest opening, {on_skin['images']} images).",
+        f"The noise of a marker's coordinate has an sd of {sd}.",
+        f"Without the markers, the intervals {wider}.",
     ]
+
+
+def markers_unused_in_words(work: str, names: Sequence[str]) -> str:
+    """Returns a sentence about recordings whose markers some work, such as "a study", does not use."""
+    begin = f"{work[0].upper()}{work[1:]}"
+    return f"{begin} infers from the force alone, so it does not use the markers of {', '.join(names)}."
 
 
 def full_run_in_words(full: Mapping[str, Any]) -> str:

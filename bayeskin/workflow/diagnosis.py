@@ -1,4 +1,4 @@
-"""Diagnoses a recording of any protocol and device: locates mismatches, names mechanisms, and shows fits."""
+"""The stage of a diagnosis, for any protocol and device: locates mismatches, names mechanisms, shows fits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayeskin.config.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.forward.joint import JointForward
 from bayeskin.forward.reduced import ReducedForward, stands_for
-from bayeskin.json_files import plain, write_json
+from bayeskin.json_files import write_json
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.assess import assess
@@ -24,14 +24,16 @@ from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.explain import explain
 from bayeskin.recordings import fitting_width_s, read_recording
 from bayeskin.reduced.region import protocol_outside
+from bayeskin.report.words import markers_unused_in_words
 from bayeskin.surrogates import train
 from bayeskin.types import Design, Surrogate
 from bayeskin.workflow import design, recording, training
 from bayeskin.workflow.diagnosis_answer import answer_of
 from bayeskin.workflow.diagnosis_figures import draw
+from bayeskin.workflow.diagnosis_forces import FORCES, forces_of
+from bayeskin.workflow.diagnosis_progress import tell_end, tell_tasks
 from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, depends_on, open_context
-from bayeskin.workflow.diagnosis_text import in_words
-from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run, run_stages
+from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run
 from bayeskin.workflow.importing import markers_beside
 from bayeskin.workflow.model import model_spec
 from bayeskin.workflow.provenance import caption
@@ -39,23 +41,6 @@ from bayeskin.workflow.reducing import reduced_file
 
 KNOWN = "the pads must only open, no further and no faster than in the training of the reduced model"
 NAME = "diagnose"
-
-
-def diagnose(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
-    """Returns the answer of `bayeskin diagnose` for a configuration's run, or for recordings by themselves.
-
-    Outputs go to the run's folder. For recordings, they go to STEM-diagnosis in the folder of the first one.
-
-    sources : a configuration, or one or several recordings of one skin
-    device : file of the device with which the recordings were made
-    Raises InputError for bad input, and for a device without a reduced model.
-    """
-    run = opened(sources, reporter, device)
-    _files(run)  # a device without a reduced model is refused before anything is written
-    outcome = run_stages(run, stages_of(run.config))[-1]
-    answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / NAME}
-    text = in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
-    return plain({**answer, "text": text})
 
 
 def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> Run:
@@ -85,12 +70,15 @@ def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
     files = [{"file": os.path.relpath(file.resolve(), folder)} for file in sources]
     if len(sources) == 1 and markers_beside(source).exists():
         files[0]["markers"] = os.path.relpath(markers_beside(source.resolve()), folder)
+    unused = [file.stem for file in sources if markers_beside(file).exists()] if len(sources) > 1 else []
+    if unused:
+        reporter.log(markers_unused_in_words("a joint diagnosis", unused))
     given: dict[str, Any] = {"recording": files[0]} if len(files) == 1 else {"recordings": files}
     given["fit"] = {"bin_width_s": width_s}
     if device is not None:
         given |= {key: section.model_dump() for key, section in load_device_file(device)}
     config = config_of({"name": re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{stems}"), **given}, source)
-    return Run(config, source, folder / f"{stems}-diagnosis", reporter)
+    return Run(config, source, folder / f"{stems}-diagnosis", reporter, from_file=False)
 
 
 def stages_of(config: Config) -> dict[str, Stage]:
@@ -152,14 +140,17 @@ def _work(run: Run) -> Mapping[str, Any]:
     context = context_of(run, source)
     learn = partial(_trained_emulator, seed=run.config.seed)
     store = run.store("answers", depends_on(context))
-    with asked(source, context, store, run.config.design.workers) as ask:
+    tell = partial(tell_tasks, run.reporter)
+    with asked(source, context, store, run.config.design.workers, tell) as ask:
         explanation = explain(context, ask, learn, run.reporter.log)
     if explanation is None:
         raise CannotGoOn("no set of mechanisms could be assessed")
     diagnosis = assess(context, explanation)
     answer = {**answer_of(diagnosis, context.known), "seconds": time.monotonic() - started}
     write_json(run.at(NAME, "diagnosis.json"), answer)
+    write_json(run.at(NAME, FORCES), forces_of(context, diagnosis))
     figures = draw(run.folder / NAME, caption(run), context, diagnosis, answer["candidates"])
+    tell_end(run.reporter)
     return {**answer, "figures": [figure.name for figure in figures]}
 
 
@@ -184,7 +175,7 @@ STAGE = Stage(
     ("seed", "model", "parameters", "noise"),
     _work,
     _files,
-    format=2,
+    format=3,
 )
 
 

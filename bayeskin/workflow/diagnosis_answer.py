@@ -16,10 +16,10 @@ from bayeskin.mismatch.gains import gains
 from bayeskin.mismatch.hypotheses import Family
 from bayeskin.mismatch.locate import Window
 from bayeskin.mismatch.misfit import misfit_n
-from bayeskin.mismatch.on_skin import OnSkin
 from bayeskin.mismatch.search_record import Names, SearchResult
 from bayeskin.types import Span
 from bayeskin.types.joint import recording_at
+from bayeskin.workflow.marker_answer import on_skin_entry
 
 
 def answer_of(diagnosis: Diagnosis, known: Mapping[str, Mechanism]) -> dict[str, Any]:
@@ -132,21 +132,16 @@ def _fit_entry(assessed: AssessedFit, split_s: float | None) -> dict[str, Any]:
         "log_evidence": fit.log_evidence,
         "theta": drawn.summary,
         "sampled": {"settled": drawn.settled, "rhat": drawn.rhat, "effective": drawn.effective},
-        **({} if assessed.on_skin is None else {"on_skin": _on_skin_entry(assessed.on_skin)}),
+        **_of_markers(assessed),
     }
 
 
-def _on_skin_entry(located: OnSkin) -> dict[str, Any]:
-    """Returns the entry of the residuals of markers; the longest significant vectors come first."""
-    length_m = np.linalg.norm(located.vector_m, axis=1)
-    order = [int(i) for i in np.argsort(-length_m) if located.significant[i]]
-    return {
-        "points": len(length_m), "significant": len(order), "rms_m": located.rms_m,
-        "largest": [
-            {"place_m": located.place_m[i].tolist(), "residual_m": located.vector_m[i].tolist()}
-            for i in order[:10]
-        ],
-    }  # fmt: skip
+def _of_markers(assessed: AssessedFit) -> dict[str, Any]:
+    """Returns the entry of the markers, and nothing for a recording without markers."""
+    if assessed.on_skin is None:
+        return {}
+    fit = assessed.fit
+    return {"on_skin": on_skin_entry(fit.log_posterior, fit.theta, assessed.on_skin)}
 
 
 def _full_model_entry(check: FullModelCheck | str) -> dict[str, Any]:

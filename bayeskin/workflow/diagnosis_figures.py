@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from bayeskin import report
-from bayeskin.mismatch.assess import AssessedFit, Diagnosis
+from bayeskin.mismatch.assess import Diagnosis
 from bayeskin.mismatch.context import DiagnosisContext
-from bayeskin.mismatch.locate import Located
-from bayeskin.types import Array, BinnedForce
 from bayeskin.types.joint import figure_name
-
-
-@dataclass(frozen=True)
-class _FitInRecording:
-    """A fit in one recording, on the recording's own axis of time; see `AssessedFit`."""
-
-    force_n: Array
-    band_n: tuple[Array, Array]
-    held_out_n: Array | None
-    located: Located
+from bayeskin.workflow.diagnosis_forces import in_recording
 
 
 def _of_recording(
@@ -33,7 +22,7 @@ def _of_recording(
     """Yields the names and the figures of one of several recordings, or of a single one."""
     whole, explanation = context.binned, diagnosis.explanation
     bins, binned, motion = whole.slices[number], whole.parts[number], context.motion.parts[number]
-    before, after = (_in_recording(fit, whole, number) for fit in (diagnosis.before, diagnosis.after))
+    before, after = (in_recording(fit, whole, number) for fit in (diagnosis.before, diagnosis.after))
     split_s = None if explanation.beginning is None else explanation.split_s
     if split_s is not None and whole.spans:
         span = whole.spans[number]
@@ -47,27 +36,6 @@ def _of_recording(
     if diagnosis.contributions:
         parts = [replace(part, force_n=part.force_n[bins]) for part in diagnosis.contributions]
         yield "contributions", report.figure_contributions(binned, motion, parts)
-
-
-def _in_recording(fit: AssessedFit, binned: BinnedForce, number: int) -> _FitInRecording:
-    """Returns a fit in one recording."""
-    bins, located, held_out_n = binned.slices[number], fit.located, fit.held_out_n
-    if binned.spans:
-        span = binned.spans[number]
-        inside = (located.bins >= bins.start) & (located.bins < bins.stop)
-        windows = tuple(
-            replace(window, start_s=window.start_s - span.start_s, end_s=window.end_s - span.start_s)
-            for window in located.windows
-            if span.start_s - 1e-9 <= window.start_s < span.end_s
-        )
-        located = replace(
-            located, windows=windows, bins=located.bins[inside] - bins.start,
-            residual_n=located.residual_n[inside], allowed_n=located.allowed_n[inside],
-        )  # fmt: skip
-    return _FitInRecording(
-        fit.force_n[bins], (fit.band_n[0][bins], fit.band_n[1][bins]),
-        None if held_out_n is None else held_out_n[bins], located,
-    )  # fmt: skip
 
 
 def draw(

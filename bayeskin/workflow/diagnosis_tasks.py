@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -96,19 +96,27 @@ def _opened_once(source: ContextSource) -> DiagnosisContext:
 
 @contextmanager
 def asked(
-    source: ContextSource, context: DiagnosisContext, store: Store, workers: int
-) -> Iterator[AnswerTasks]:
+    source: ContextSource, context: DiagnosisContext, store: Store, workers: int,
+    tell_tasks: Callable[[int], None],
+) -> Iterator[AnswerTasks]:  # fmt: skip
     """Yields a function that answers tasks in worker processes, and keeps all answers in a store.
 
     A task whose answer is in the store is not run again.
+
+    tell_tasks : receives the number of tasks that are done, after each that was run. Those whose answers were
+        in the store are counted, but not told, because they say nothing about the pace
     """
     with standing(_Worker(source), workers) as run_all, store:
+        done: set[str] = set()
 
         def ask(tasks: Sequence[Task]) -> list[object]:
             keys = [sha256_of([type(task).__name__, asdict(task)]) for task in tasks]
             new = [i for i, key in enumerate(keys) if key not in store]
+            done.update(key for key in keys if key in store)
             for i, result in run_all([tasks[i] for i in new]):
                 store.add(keys[new[i]], {"message": result.reason} if isinstance(result, Lost) else result)
+                done.add(keys[new[i]])
+                tell_tasks(len(done))
             return [
                 read_answer(context, task, store.read(key, dict))
                 for task, key in zip(tasks, keys, strict=True)

@@ -5,31 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayeskin.report.words import (
-    agreement_in_words,
-    faint_in_words,
-    full_run_in_words,
-    informed_in_words,
-)
+from bayeskin.report.conclusion import conclusion_of
+from bayeskin.report.words import agreement_in_words, full_run_in_words, informed_in_words, markers_in_words
 
 
 def in_words(answer: Mapping[str, Any]) -> str:
-    """Returns the answer as text."""
+    """Returns the answer as text, which ends with the three sentences of its conclusion."""
     lines = [f"verdict: {answer['verdict']}"]
     lines += [f"  {mechanism['name']} (probability {mechanism['probability']:.2f}): {mechanism['statement']}"
               for mechanism in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
     lines.append(f"  an unnamed smooth discrepancy: probability {answer['smooth_probability']:.2f}")
-    lines += [f"  {faint}" for faint in faint_in_words(answer)]
     lines.append(
         f"The model deviates from the recording in {len(answer['located'])} windows, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
     )
     for recording in answer["recordings"]:
         lines += [agreement_in_words(recording), informed_in_words(recording)]
-    lines += [_fit_line(label, answer["fit"][label]) for label in ("before", "after")]
-    lines += [_skin_line(label, answer["fit"][label]) for label in ("before", "after")
-              if "on_skin" in answer["fit"][label]]  # fmt: skip
+    if "on_skin" in answer["fit"]["after"]:
+        lines += markers_in_words(answer["fit"]["after"]["on_skin"])
     lines.append(full_run_in_words(answer["full_model"]))
     after = answer["fit"]["after"]
     if not (after["emulator"]["settled"] and after["sampled"]["settled"]):
@@ -39,20 +33,6 @@ def in_words(answer: Mapping[str, Any]) -> str:
     )
     if best:
         lines.append(f"gain of log-evidence by single mechanisms: {best}")
-    lines.append(f"outputs in {answer['folder']}")
-    return "\n".join(lines)
-
-
-def _skin_line(label: str, fit: Mapping[str, Any]) -> str:
-    """Returns a line about the markers that move otherwise than a fit says."""
-    located = fit["on_skin"]
-    line = f"{label}: at {located['significant']} of {located['points']} markers the skin moves otherwise"
-    return f"{line}, {1e3 * located['rms_m']:.3f} mm RMS at the largest opening"
-
-
-def _fit_line(label: str, fit: Mapping[str, Any]) -> str:
-    """Returns a line with the errors of a fit."""
-    line, held_out = f"{label}: RMSE {1e3 * fit['rmse']:.1f} mN", fit["rmse_held_out"]
-    if held_out is None:
-        return line
-    return f"{line}, {1e3 * held_out:.1f} mN after the second hold, which was not fitted"
+    lines += [f"outputs in {answer['folder']}", f"report: {answer['page']}"]
+    conclusion = conclusion_of(answer)
+    return "\n".join([*lines, f"{conclusion.verdict}.", *conclusion.sentences])

@@ -22,11 +22,13 @@ from typing import TYPE_CHECKING, Any
 import bayeskin
 from bayeskin.errors import reason_of
 from bayeskin.workflow.doctor_models import Finding, cores, finding_of, findings_of_models
+from bayeskin.workflow.remedies import install, reinstall
 
 if TYPE_CHECKING:
     from bayeskin.workflow.engine import Reporter
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+PYTHON = "install bayeskin with a newer Python: python3.11 -m venv .venv && .venv/bin/python -m pip install ."
 LEAST_FREE_BYTES = 500_000_000  # a run's folder with its chains takes a tenth of this
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9_.-]+)\s*(?:\[[^]]*\])?\s*([^;]*?)\s*(?:;\s*(.*))?$")
 
@@ -36,7 +38,9 @@ def examine(folder: Path, reporter: Reporter) -> dict[str, Any]:
     packages = list(_packages())
     findings = [
         Finding("bayeskin", True, bayeskin.__version__),
-        Finding("python", sys.version_info >= (3, 11), platform.python_version(), "Python 3.11 or newer"),
+        Finding(
+            "python", sys.version_info >= (3, 11), platform.python_version(), "Python 3.11 or newer", PYTHON
+        ),
         *packages,
         finding_of("linear solver", _solver),
         _threads(),
@@ -47,7 +51,7 @@ def examine(folder: Path, reporter: Reporter) -> dict[str, Any]:
     ok = all(finding.ok for finding in findings)
     lines = [
         f"{'ok    ' if finding.ok else 'BROKEN'}  {finding.name}: {finding.state}"
-        + ("" if finding.ok else f"; needed: {finding.needed}")
+        + ("" if finding.ok else f"; needed: {finding.needed}; remedy: {finding.remedy}")
         for finding in findings
     ]
     text = "\n".join([*lines, "all is well" if ok else "something is broken"])
@@ -67,7 +71,7 @@ def _packages() -> Iterator[Finding]:
     try:
         requirements = metadata.requires("bayeskin") or []
     except metadata.PackageNotFoundError:
-        yield Finding("packages", False, "bayeskin is not installed", "pip install bayeskin")
+        yield Finding("packages", False, "bayeskin is not installed", "an installed bayeskin", reinstall())
         return
     for line in requirements:
         matched = _REQUIREMENT.match(line)
@@ -78,9 +82,9 @@ def _packages() -> Iterator[Finding]:
             continue
         version = _version(name)
         if version is not None:
-            yield Finding(name, within(version, limits), version, limits)
+            yield Finding(name, within(version, limits), version, limits, install(f"{name}{limits}"))
         elif not marker:
-            yield Finding(name, False, "not installed", limits or "any version")
+            yield Finding(name, False, "not installed", limits or "any version", install(f"{name}{limits}"))
 
 
 def _version(name: str) -> str | None:
@@ -125,7 +129,8 @@ def _disk_space(folder: Path) -> Finding:
     """Returns whether the disk has enough free space for a run."""
     free = shutil.disk_usage(folder).free
     needed = f"at least {LEAST_FREE_BYTES / 1e9:g} GB"
-    return Finding("disk space", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free", needed)
+    remedy = f"remove files from the disk of {folder}, or work in a folder on another disk"
+    return Finding("disk space", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free", needed, remedy)
 
 
 def _write_access(folder: Path) -> Finding:
@@ -134,7 +139,6 @@ def _write_access(folder: Path) -> Finding:
         with tempfile.TemporaryFile(dir=folder) as handle:
             handle.write(b"bayeskin")
     except OSError as error:
-        return Finding(
-            "write access", False, f"{folder}: {reason_of(error)}", "a folder in which runs can be written"
-        )
+        needed, remedy = "a folder in which runs can be written", "work in a folder of your own: cd ~"
+        return Finding("write access", False, f"{folder}: {reason_of(error)}", needed, remedy)
     return Finding("write access", True, str(folder))

@@ -13,6 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from bayeskin.errors import InputError
+from bayeskin.workflow.remedies import compile_anew, reinstall, restore
+
 if TYPE_CHECKING:
     from bayeskin.types import PadMotion
     from bayeskin.workflow.engine import Reporter
@@ -25,25 +28,42 @@ REDUCED_MODEL_N, REDUCED_MODEL_TOLERANCE = 0.089127, 1e-4  # of one solve that e
 SURROGATE_N, SURROGATE_TOLERANCE = 0.378489, 1e-5  # the largest mean force of its prediction
 POSTERIOR_NATS, POSTERIOR_TOLERANCE = 1105.8178, 1e-5  # its log-likelihood with the noise below
 NOISE_SD_N, NOISE_TAU_S, NOISE_NU = 1e-3, 1.0, 8.0
-COMPLETE = "a complete installation (reinstall bayeskin)"
+ALIVE = "a process that is not killed"
+MEMORY = "free memory (2 GB are enough), and run bayeskin doctor again"
+COMPLETE = "a complete installation"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check: whether the part works, its state, and what it needs."""
+    """The result of one check: whether the part works, its state, what it needs, and what mends it."""
 
     name: str
     ok: bool
     state: str
     needed: str = ""
+    remedy: str = ""
 
 
 def finding_of(name: str, check: Callable[[], Finding]) -> Finding:
     """Returns the finding of a check; a check that raises any error is a finding too."""
     try:
         return check()
+    except InputError as error:  # a shipped file is absent or damaged
+        state, file = f"{error.where}: {error.problem}", error.where.partition(": ")[0]
+        return Finding(name, False, state, COMPLETE, restore(file))
+    except ImportError as error:
+        return Finding(name, False, _in_a_line(error), COMPLETE, reinstall())
     except Exception as error:  # a broken installation can raise any error
-        return Finding(name, False, f"{type(error).__name__}: {error}", COMPLETE)
+        return Finding(name, False, _in_a_line(error), COMPLETE, anew_or_again())
+
+
+def _in_a_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def anew_or_again() -> str:
+    """Returns the remedy for a model that does not work: compiled code that is damaged, or packages."""
+    return f"{compile_anew()}; if this does not help: {reinstall()}"
 
 
 def findings_of_models(reporter: Reporter) -> list[Finding]:
@@ -55,12 +75,14 @@ def findings_of_models(reporter: Reporter) -> list[Finding]:
         "40 seconds on two cores."
     )
     findings: dict[int, Finding] = {}
-    for index, result in run_parallel(_finding_of_model, list(CHECKS), min(cores(), len(CHECKS))):
-        name = list(CHECKS)[index]
-        findings[index] = (
-            Finding(name, False, result.reason, COMPLETE) if isinstance(result, Lost) else result
-        )
-        reporter.progress("models", len(findings) / len(CHECKS), name)
+    try:
+        for index, result in run_parallel(_finding_of_model, list(CHECKS), min(cores(), len(CHECKS))):
+            name = list(CHECKS)[index]
+            lost = isinstance(result, Lost)
+            findings[index] = Finding(name, False, result.reason, ALIVE, MEMORY) if lost else result
+            reporter.progress("models", len(findings) / len(CHECKS), name)
+    except InputError as error:  # the processes end before they begin
+        return [Finding("models", False, f"{error.where}: {error.problem}", COMPLETE, reinstall())]
     return [findings[index] for index in sorted(findings)]
 
 
@@ -92,7 +114,7 @@ def reduced_model_finding() -> Finding:
     started, name = time.perf_counter(), "reduced model"
     run = simulate_reduced(load_reduced(shipped(SHIPPED)), _pull(), THETA, gradients={"E_c": THETA["E_c"]})
     if run.status != "ok":
-        return Finding(name, False, run.message, "a run without an error")
+        return Finding(name, False, run.message, "a run without an error", anew_or_again())
     return _compared(name, float(run.force_n[-1]), REDUCED_MODEL_N, REDUCED_MODEL_TOLERANCE, started)
 
 
@@ -103,7 +125,7 @@ def full_model_finding() -> Finding:
     started, name = time.perf_counter(), "full model"
     run = simulate(ModelSpec(), _pull(), THETA, gradients={"E_c": THETA["E_c"]})
     if run.status != "ok":
-        return Finding(name, False, run.message, "a run without an error")
+        return Finding(name, False, run.message, "a run without an error", anew_or_again())
     return _compared(name, float(run.force_n[-1]), FULL_MODEL_N, FULL_MODEL_TOLERANCE, started)
 
 
@@ -156,7 +178,7 @@ def _compared(
     ok = math.isclose(found, expected, rel_tol=tolerance)
     return Finding(
         name, ok, f"{found:.6f} {unit} in {time.perf_counter() - started:.1f} s",
-        f"{expected:.6f} {unit} within {100 * tolerance:g} %",
+        f"{expected:.6f} {unit} within {100 * tolerance:g} %", anew_or_again(),
     )  # fmt: skip
 
 

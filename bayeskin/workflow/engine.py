@@ -47,12 +47,16 @@ class CannotGoOn(Exception):
 
 @dataclass(frozen=True)
 class Run:
-    """A configuration and the folder of its outputs."""
+    """A configuration and the folder of its outputs.
+
+    from_file : whether the configuration is a file; otherwise `config_path` is the first recording
+    """
 
     config: Config
     config_path: Path
     folder: Path
     reporter: Reporter
+    from_file: bool = True
 
     def at(self, stage: str, file: str) -> Path:
         """Returns the path of an output of a stage."""

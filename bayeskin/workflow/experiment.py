@@ -26,15 +26,16 @@ from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.explain import searched
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.tasks import AnswerTasks
-from bayeskin.workflow import diagnosis
+from bayeskin.workflow.diagnosing import diagnose, stages_of_page
 from bayeskin.workflow.diagnosis import context_of, opened, source_of
 from bayeskin.workflow.diagnosis_tasks import asked, depends_on
-from bayeskin.workflow.engine import Reporter, Run
+from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.executor import WORKERS
-from bayeskin.workflow.folder import Record, current_record, locked, output_hashes, read_record, write_record
+from bayeskin.workflow.folder import Record, locked, output_hashes, write_record
+from bayeskin.workflow.further_tests import FOLDER, diagnosis_hash
+from bayeskin.workflow.page import write_page
 from bayeskin.workflow.provenance import caption
 
-FOLDER = "experiment"
 LONGEST_S = 1800.0  # longest test: a person can hardly keep an arm still for longer
 
 
@@ -57,16 +58,17 @@ def choose(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
             f"model.observation is {model.observation!r} on {model.mesh!r}",
             "an experiment needs 'reaction' on 'bricks'",
         )
-    diagnosed = diagnosis.diagnose(sources, reporter, device)
+    diagnosed = diagnose(sources, reporter, device)
     if "best_set" not in diagnosed:
         return diagnosed
     folder = run.folder / FOLDER
     with locked(run.folder):
-        started, diagnosis_hash = time.monotonic(), _diagnosis_hash(run)
+        started, judged = time.monotonic(), diagnosis_hash(run)
         folder.mkdir(parents=True, exist_ok=True)
         context_source = source_of(run)
         context = context_of(run, context_source)
-        with asked(context_source, context, run.store("answers", depends_on(context)), WORKERS) as ask:
+        store = run.store("answers", depends_on(context))
+        with asked(context_source, context, store, WORKERS, lambda _: None) as ask:
             all_fits = [set_fit.fit for set_fit in searched(context, ask, reporter.log).fits.values()]
             fits = compete(all_fits, diagnosed["best_set"], context.known)
             experiments = _judged_protocols(fits, context, ask, reporter) if len(fits) > 1 else []
@@ -83,19 +85,10 @@ def choose(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
             _write_corners(experiments[0].protocol, folder / "next.csv")
         write_json(folder / "experiment.json", answer)
         seconds = time.monotonic() - started
-        write_record(folder, Record(diagnosis_hash, True, seconds, output_hashes(folder), plain(answer)))
-    return plain({**answer, "folder": folder, "text": _in_words(answer)})
-
-
-def answered(run: Run) -> Record | None:
-    """Returns the record of the experiments for the diagnosis in the run's folder, or None without one."""
-    return current_record(run.folder / FOLDER, _diagnosis_hash(run))
-
-
-def _diagnosis_hash(run: Run) -> str:
-    """Returns the hash of the diagnosis in the run's folder, or "" without one."""
-    record = read_record(run.folder / diagnosis.NAME)
-    return "" if record is None else record.sha256
+        write_record(folder, Record(judged, True, seconds, output_hashes(folder), plain(answer)))
+    page = write_page(run, stages_of_page(run))
+    text = f"{_in_words(answer)}\nreport: {page}"
+    return plain({**answer, "folder": folder, "page": page, "text": text})
 
 
 def _judged_protocols(

@@ -12,9 +12,10 @@ from bayeskin import storage
 from bayeskin.config import parameter_space
 from bayeskin.report.page import RunFacts, StageFacts, render_page
 from bayeskin.sensitivity.result import SobolResult
-from bayeskin.workflow import experiment
+from bayeskin.workflow.diagnosis_forces import FORCES
 from bayeskin.workflow.engine import Run, Stage, standing
 from bayeskin.workflow.folder import Record
+from bayeskin.workflow.further_tests import FOLDER, judged_tests
 
 FILE = "report.html"
 
@@ -34,13 +35,13 @@ def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
     config = run.config
     space = parameter_space(config, run.config_path)
     states = standing(run, stages)
-    if states.get("diagnose", ("", None))[0] == "done" and (answered := experiment.answered(run)) is not None:
-        states[experiment.FOLDER] = "done", answered
+    if states.get("diagnose", ("", None))[0] == "done" and (answered := judged_tests(run)) is not None:
+        states[FOLDER] = "done", answered
     facts = {name: _facts(run, name, *state) for name, state in states.items() if name != "report"}
     return RunFacts(
         name=config.name,
         config_path=str(run.config_path),
-        config_text=run.config_path.read_text(encoding="utf-8-sig"),
+        config_text=run.config_path.read_text(encoding="utf-8-sig") if run.from_file else "",
         config_sha256=config.sha256,
         version=bayeskin.__version__,
         seed=config.seed,
@@ -50,6 +51,7 @@ def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
         stages=facts,
         history=_history(run) if "sample" in facts and facts["sample"].done else None,
         indices=_indices(run, facts["sobol"]) if "sobol" in facts else {},
+        forces=_forces(run) if "diagnose" in facts and facts["diagnose"].done else (),
     )
 
 
@@ -72,6 +74,12 @@ def _history(run: Run) -> dict[str, Any]:
     """Returns the bands of the stage `sample`."""
     history: dict[str, Any] = json.loads(run.at("sample", "bands.json").read_text(encoding="utf-8"))
     return history
+
+
+def _forces(run: Run) -> list[dict[str, Any]]:
+    """Returns the forces of the stage `diagnose`."""
+    forces: list[dict[str, Any]] = json.loads(run.at("diagnose", FORCES).read_text(encoding="utf-8"))
+    return forces
 
 
 def _indices(run: Run, stage: StageFacts) -> dict[str, SobolResult]:

@@ -16,8 +16,9 @@ from bayeskin.config import Config
 from bayeskin.hashing import sha256_of
 from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.json_files import write_json
+from bayeskin.mismatch.on_skin import on_skin
 from bayeskin.number_format import quantity
-from bayeskin.types import PadMotion, Provenance, Recording
+from bayeskin.types import Array, PadMotion, Provenance, Recording
 from bayeskin.types.joint import figure_name
 from bayeskin.workflow.calibration import refined_posterior, rmse_table
 from bayeskin.workflow.checking import (
@@ -29,6 +30,7 @@ from bayeskin.workflow.checking import (
     with_full_model,
 )
 from bayeskin.workflow.engine import Run, Stage
+from bayeskin.workflow.marker_answer import on_skin_entry
 from bayeskin.workflow.model import model_spec
 from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.shipping import shipped_files
@@ -52,19 +54,41 @@ def _sample_posterior(run: Run) -> Mapping[str, Any]:
     profiles = inference.profiles(log_posterior, best, inference.evenly(posterior.flat, PROFILED_DRAWS))
     residuals = _residuals(checked)
     _draw_figures(run, checked, best, drawn, profiles, residuals)
+    of_markers = _of_markers(run, checked)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
     write_json(run.at("sample", "bands.json"), _bands_by_bin(log_posterior, bands))
     return {
         **_posterior_summary(checked, bands, residuals),
+        **({} if of_markers is None else {"on_skin": of_markers}),
         "profiles": {profile.name: _profile_summary(profile) for profile in profiles},
     }
 
 
 def _residuals(checked: Checked) -> inference.ResidualCheck:
     """Returns the check of the residuals at the most probable draw."""
-    log_posterior, posterior = checked.log_posterior, checked.posterior
-    best = posterior.flat[int(np.argmax(posterior.log_prob))]
-    return inference.check_residuals(log_posterior, log_posterior.to_sampling(best))
+    log_posterior = checked.log_posterior
+    return inference.check_residuals(log_posterior, log_posterior.to_sampling(_best_draw(checked)))
+
+
+def _best_draw(checked: Checked) -> Array:
+    """Returns the most probable draw (D,)."""
+    posterior = checked.posterior
+    return np.asarray(posterior.flat[int(np.argmax(posterior.log_prob))])
+
+
+def _of_markers(run: Run, checked: Checked) -> dict[str, Any] | None:
+    """Returns the entry of the markers at the most probable draw, and draws their residuals on the skin.
+
+    The result is None for a recording without markers.
+    """
+    log_posterior, motion = checked.log_posterior, storage.load(run.at("recording", "motion.h5"), PadMotion)
+    theta = dict(zip(log_posterior.names, map(float, _best_draw(checked)), strict=True))
+    located = on_skin(log_posterior, theta, motion)
+    if located is None:
+        return None
+    figure = report.figure_on_skin(located, run.config.geometry(run.config_path).geometry)
+    report.save_figure(figure, run.at("sample", "on_skin"), caption(run))
+    return on_skin_entry(log_posterior, theta, located)
 
 
 def _residual_summary(residuals: inference.ResidualCheck) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from bayeskin.proof.verdicts import (
     store_verdict,
 )
 from bayeskin.shipped import shipped
-from bayeskin.workflow import diagnosis
+from bayeskin.workflow import diagnosing
 from bayeskin.workflow.diagnosing_sources import diagnosing_sources
 from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.folder import locked
@@ -47,7 +47,7 @@ def prove(
     reporter: Reporter,
     rediagnose: int = 0,
     at_most: int | None = None,
-    diagnose: Diagnose = diagnosis.diagnose,
+    diagnose: Diagnose = diagnosing.diagnose,
 ) -> dict[str, Any]:
     """Diagnoses the recordings without a verdict, scores all verdicts, and returns the command's answer.
 

@@ -9,7 +9,7 @@ from typing import Any
 from bayeskin.config import Config
 from bayeskin.json_files import plain, write_json
 from bayeskin.number_format import at_edge
-from bayeskin.report.words import polished_in_words, prior_in_words
+from bayeskin.report.words import markers_in_words, polished_in_words, prior_in_words
 from bayeskin.workflow import design, diagnosis, indices, maximum, posterior, recording, training
 from bayeskin.workflow.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.workflow.executor import with_scheduler
@@ -67,6 +67,7 @@ def _write_summary(run: Run) -> Mapping[str, Any]:
             "posterior_mean": sampled["rmse"],
             "full_model_at_map": map_summary["rmse_of_full_model"],
         },
+        **({"on_skin": sampled["on_skin"]} if "on_skin" in sampled else {}),
         "coverage_90": {"whole": sampled["coverage_90"], "fitted": sampled["coverage_90_fitted"]},
         "rms_sd_n": sampled["rms_sd_n"],
         "sobol": summaries["sobol"],
@@ -206,6 +207,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
             *_identifiability_lines([*said["identifiability"], *_length_sentences(said["lengths"])]),
             *_prior_lines(said["posterior"]),
             *said["remarks"],
+            *(markers_in_words(said["on_skin"]) if "on_skin" in said else []),
             f"{model}: RMSE {', '.join(off)}",
             error["message"],
             f"outputs in {folder}, {sum(said['seconds'].values()):.0f} s in all",

@@ -17,6 +17,7 @@ from bayeskin.errors import InputError
 from bayeskin.hashing import sha256_of, sha256_of_file
 from bayeskin.json_files import plain, write_json
 from bayeskin.report.page import StudyFacts, render_study
+from bayeskin.report.words import markers_unused_in_words
 from bayeskin.study import (
     Entry,
     Individual,
@@ -28,6 +29,7 @@ from bayeskin.study import (
 )
 from bayeskin.workflow import folder
 from bayeskin.workflow.engine import Reporter
+from bayeskin.workflow.importing import markers_beside
 from bayeskin.workflow.study_answer import population_in_json
 from bayeskin.workflow.study_protocols import protocol, with_shared_surrogates
 from bayeskin.workflow.study_recordings import (
@@ -60,10 +62,14 @@ def study(path: Path, reporter: Reporter, scheduler: str | None = None) -> dict[
         file = replace(file, config=file.config.model_copy(update={"design": design}))
     entries = read_table(file.table)
     members = members_of(file, entries)
+    unused = [entry.name for entry in entries if markers_beside(entry.recording).exists()]
+    if unused:
+        reporter.log(markers_unused_in_words("a study", unused))
     with folder.locked(file.folder):
         posteriors, left_out = _posteriors(file, members, reporter)
         answer = {**_facts(file), **_population(file, posteriors, reporter)}
         answer["recordings"] = _rows(file, members, left_out, answer.get("recordings", []))
+        answer["markers_unused"] = unused
         answer["left_out"] = {member.member.entry.name: member.reason for member in left_out}
         write_json(file.folder / ANSWER, answer)
         page = _write_page(file, plain(answer))
@@ -189,5 +195,6 @@ def _text(answer: Mapping[str, Any], count: int, page: Path) -> str:
         *answer.get("sentences", ()),
         f"{count - len(left_out)} of {count} recordings enter.",
         *(f"left out: {name}: {reason}" for name, reason in left_out.items()),
+        *([markers_unused_in_words("a study", answer["markers_unused"])] if answer["markers_unused"] else []),
         f"report: {page}",
     ])  # fmt: skip

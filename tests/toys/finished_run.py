@@ -24,6 +24,18 @@ HISTORY = {
     "low_90_n": [-0.02, 0.09, 0.18, 0.27],
     "high_90_n": [0.02, 0.13, 0.22, 0.31],
 }
+FORCES = [
+    {
+        "name": "",
+        "time_s": [0.25, 0.75, 1.25, 1.75],
+        "recorded_n": [0.0, 0.1, None, 0.3],
+        "before_n": [0.01, 0.18, 0.25, 0.3],
+        "after_n": [0.0, 0.11, 0.2, 0.29],
+        "low_90_n": [-0.02, 0.09, 0.18, 0.27],
+        "high_90_n": [0.02, 0.13, 0.22, 0.31],
+        "windows": [{"start_s": 0.5, "end_s": 1.5, "mean_n": -0.08}],
+    }
+]
 _NONE = np.full((2, 2, 4), np.nan)
 INDICES = SobolResult(
     names=("E_c", "p_init"), edges_s=np.arange(0.0, 2.5, 0.5),
@@ -51,6 +63,13 @@ def _parameter(prior: str, low: float, median: float, high: float, unit: str = "
         "high_90": high, "ess": 3000.0, "rhat": 1.0007,
         "prior": {"kind": prior, "lower": 0.5 * low, "upper": 2.0 * high, "source": "an earlier study"},
     }  # fmt: skip
+
+
+ON_SKIN = {
+    "points": 25, "images": 31, "sd_m": 1.98e-5, "significant": 2, "rms_m": 1.2e-4,
+    "widens": {"E_c": 4.5, "p_init": 1.0},
+    "largest": [{"point": "c3", "place_m": [0.006, -0.012], "residual_m": [-0.0003, 0.0001]}],
+}  # fmt: skip
 
 
 def summaries() -> dict[str, dict[str, Any]]:
@@ -126,7 +145,7 @@ def summaries() -> dict[str, dict[str, Any]]:
                        "shift_error_sd": 0.08}
                 for name, median in (("E_c", 51e3), ("p_init", 840.0), ("sd_rest", 0.0029))
             },
-            "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
+            "on_skin": ON_SKIN, "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
             "rms_sd_n": {"model": 0.0013, "surrogate": 0.0009, "noise": 0.0042},
         },
         "sobol": {
@@ -148,7 +167,9 @@ def summaries() -> dict[str, dict[str, Any]]:
             "located": [{"t0": 0.0, "t1": 9.5, "phase": "rest", "cycle": 0, "mean_residual": -0.0586,
                          "significance": 0.001}],
             "remaining": [], "smooth_probability": 0.07, "nothing_probability": 0.0,
-            "best_set": ["device-friction"], "full_model": {"rmse": 0.0213, "fit_off_by": 0.0004},
+            "best_set": ["device-friction"], "held_out_set": None,
+            "sets": [{"mechanisms": ["device-friction"], "probability": 0.98}],
+            "full_model": {"rmse": 0.0213, "fit_off_by": 0.0004},
             "mechanisms": [
                 {"name": "device-friction", "probability": 0.98, "group": ["device-friction", "viscous-drag"],
                  "group_probability": 1.0, "contribution_n": 0.03, "statement": "The slide rubs: 60 mN.",
@@ -158,7 +179,8 @@ def summaries() -> dict[str, dict[str, Any]]:
                            {"name": "backlash", "delta_score": -1.5, "standard_error": 0.2}],
             "fit": {
                 when: {"rmse": rmse, "rmse_by_phase": {"rest": rmse}, "rmse_held_out": None,
-                       "coverage90": 0.9, "rmse_of_mean": rmse}
+                       "coverage90": 0.9, "rmse_of_mean": rmse, "on_skin": ON_SKIN,
+                       "emulator": {"settled": True}, "sampled": {"settled": True}}
                 for when, rmse in (("before", 0.08), ("after", 0.0247))
             },
             "unexplained": {
@@ -214,6 +236,6 @@ def facts(**changed: Any) -> RunFacts:
         "name": "forearm", "config_path": "runs/forearm.toml", "config_text": 'name = "forearm"\n',
         "config_sha256": "c" * 64, "version": "0.1.0", "seed": 7, "observation": "reaction", "mesh": "bricks",
         "parameters": PARAMETERS, "stages": stages,
-        "history": HISTORY, "indices": {"prior_gp": INDICES},
+        "history": HISTORY, "indices": {"prior_gp": INDICES}, "forces": FORCES,
     }  # fmt: skip
     return RunFacts(**{**given, **changed})

@@ -10,10 +10,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayeskin.inference.identify import Informed
-from bayeskin.number_format import interval, number, percent, quantity, scale, with_unit
+from bayeskin.number_format import interval, percent, quantity, scale, with_unit
+from bayeskin.report.conclusion import conclusion_of
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.parts import Answer, Bar, ParameterSummary, Verdict
-from bayeskin.report.words import faint_in_words, prior_in_words
+from bayeskin.report.words import prior_in_words
 
 _TONES = {Informed.WELL: "good", Informed.WEAKLY: "doubt", Informed.NOT: "none"}
 _THREE = ("low_90", "median", "high_90")
@@ -90,34 +91,12 @@ def _trust_verdict(facts: RunFacts) -> Verdict:
 
 
 def _missing_physics(facts: RunFacts) -> Verdict:
-    """Returns which physics the model lacks, from the diagnosis."""
+    """Returns the conclusion of the diagnosis, or why there is none yet."""
     diagnosis = facts.said("diagnose")
-    if not diagnosis:
-        standing = facts.stage("diagnose").standing
-        reason = [f"The physics that is missing is not known: the stage diagnose is {standing}."]
-        return Verdict("not known yet", "none", reason, f"bayeskin diagnose {facts.config_path}")
-    rmse = [quantity(diagnosis["fit"][when]["rmse"], "N") for when in ("before", "after")]
-    probability = number(diagnosis["smooth_probability"])
-    smooth_line = f"Probability of a smooth effect that is not in the catalogue: {probability}."
-    if diagnosis["verdict"] == "nothing-missing":
-        fit_line = f"The recording stays within what the model allows ({rmse[0]} RMSE)."
-        lines = [fit_line, smooth_line]
-        if faint := faint_in_words(diagnosis):
-            return Verdict("nothing that could be named", "doubt", [*faint, *lines])
-        return Verdict("nothing", "good", lines)
-    lines = [
-        f"{mechanism['statement']} (probability {number(mechanism['probability'])})"
-        for mechanism in diagnosis["mechanisms"]
-    ]
-    lines.append(f"The RMSE is {rmse[0]} without and {rmse[1]} with the best set of mechanisms.")
-    remaining = len(diagnosis["remaining"])
-    if remaining:
-        lines.append(f"{remaining} window{'s' * (remaining != 1)} of the recording remain unexplained.")
-    lines.append(smooth_line)
-    if diagnosis["verdict"] == "named":
-        return Verdict("named", "doubt", lines)
-    if diagnosis["best_set"]:
-        lines.append(f"The best set of the catalogue is {', '.join(diagnosis['best_set'])}.")
-    several = diagnosis["smooth_probability"] < 0.5
-    word = "something that several causes would explain" if several else "something outside the catalogue"
-    return Verdict(word, "doubt", lines)
+    if diagnosis:
+        conclusion = conclusion_of(diagnosis, facts.said("experiment") or None)
+        nothing = diagnosis["verdict"] == "nothing-missing" and not diagnosis["best_set"]
+        return Verdict(conclusion.verdict, "good" if nothing else "doubt", conclusion.sentences)
+    standing = facts.stage("diagnose").standing
+    reason = [f"The physics that is missing is not known: the stage diagnose is {standing}."]
+    return Verdict("not known yet", "none", reason, f"bayeskin diagnose {facts.config_path}")

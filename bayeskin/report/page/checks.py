@@ -184,8 +184,8 @@ def provenance(facts: RunFacts) -> Section:
     """Returns the section on provenance: version, configuration, hashes, seed, and state of each stage."""
     pairs = [
         ("bayeskin", facts.version),
-        ("configuration", facts.config_path),
-        ("its sha256", facts.config_sha256),
+        ("configuration" if facts.config_text else "recording", facts.config_path),
+        ("sha256 of the configuration", facts.config_sha256),
         ("recording's sha256", str(facts.said("recording").get("sha256", "–"))),
         ("model", f"{facts.observation} on {facts.mesh}"),
         ("model's hash", str(facts.said("design").get("model_hash", "–"))),
@@ -199,7 +199,7 @@ def provenance(facts: RunFacts) -> Section:
         [
             Facts(pairs),
             Table("Stages", head, rows),
-            Source("The configuration file", facts.config_text),
+            *([Source("The configuration file", facts.config_text)] if facts.config_text else []),
         ],
     )
 

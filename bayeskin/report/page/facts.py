@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,6 +38,7 @@ class RunFacts:
     parameters : meaning of each parameter of the model, by name and in the model's order
     history : recorded bins and their prediction, as the stage `sample` writes them
     indices : Sobol' indices over time, by the name of their distribution, as the stage `sobol` writes them
+    forces : recorded and fitted forces of each recording, as the stage `diagnose` writes them
     """
 
     name: str
@@ -52,6 +53,7 @@ class RunFacts:
     stages: Mapping[str, StageFacts]
     history: Mapping[str, Any] | None = None
     indices: Mapping[str, SobolResult] = field(default_factory=dict)
+    forces: Sequence[Mapping[str, Any]] = ()
 
     def stage(self, name: str) -> StageFacts:
         """Returns the facts of a stage; an unknown stage counts as not run."""
@@ -61,3 +63,11 @@ class RunFacts:
         """Returns the summary of a stage that is done, and an empty mapping otherwise."""
         facts = self.stage(stage)
         return facts.summary if facts.done else {}
+
+    @property
+    def calibrated(self) -> bool:
+        """Returns whether the stages of a calibration belong to the page.
+
+        They do not where a diagnosis was made and nothing else was asked for.
+        """
+        return not self.said("diagnose") or self.stage("sample").standing != "not run"

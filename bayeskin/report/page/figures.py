@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from xml.etree.ElementTree import ParseError
 
 from bayeskin.report.page.facts import RunFacts
@@ -10,6 +10,11 @@ from bayeskin.report.page.parts import Picture
 from bayeskin.report.page.svg import inline_svg
 
 _SOBOL = "Sobol' indices of each parameter, first order and total, over time and aggregated"
+_ON_SKIN = (
+    "Where on the skin the markers move otherwise, {} the diagnosis",
+    "Residual vectors of the markers on the skin between the pads, with the strains that the model lacks "
+    "along the pull and across it.",
+)
 # title and description, by stage and name of the figure
 FIGURES = {
     ("recording", "recording"): (
@@ -51,6 +56,7 @@ FIGURES = {
         "Profile likelihoods",
         "Best fit of the recording for each value of one parameter over its prior, with the posterior.",
     ),
+    ("sample", "on_skin"): ("Where on the skin the markers move otherwise than the model says", _ON_SKIN[1]),
     ("sample", "traces"): ("The chains", "Traces of each parameter over the sampler's steps, by ensemble."),
     ("sample", "residuals"): (
         "Residuals and the assumed noise",
@@ -99,6 +105,8 @@ FIGURES = {
         "The part of the residual that no change of the parameters can explain, and the smooth process that "
         "describes it, over time and displacement.",
     ),
+    ("diagnose", "on_skin_before"): (_ON_SKIN[0].format("before"), _ON_SKIN[1]),
+    ("diagnose", "on_skin_after"): (_ON_SKIN[0].format("after"), _ON_SKIN[1]),
     ("experiment", "experiments"): (
         "What further tests would show",
         "Expected information of each protocol about the true explanation, with standard errors.",
@@ -106,8 +114,13 @@ FIGURES = {
 }  # fmt: skip
 
 
-def pictures(facts: RunFacts, stage: str, names: Iterable[str] | None = None) -> list[Picture]:
-    """Returns the figures of a stage: those of the given names, or all, with the known ones first."""
+def pictures(
+    facts: RunFacts, stage: str, names: Iterable[str] | None = None, without: Collection[str] = ()
+) -> list[Picture]:
+    """Returns the figures of a stage: those of the given names, or all, with the known ones first.
+
+    without : names of figures that are left out
+    """
     drawn = facts.stage(stage).figures
     known = [name for owner, name in FIGURES if owner == stage]
     wanted = names if names is not None else [*known, *sorted(set(drawn) - set(known))]
@@ -115,7 +128,7 @@ def pictures(facts: RunFacts, stage: str, names: Iterable[str] | None = None) ->
     for name in sorted(drawn, key=lambda name: (len(name), name)):
         by_name.setdefault(_of_first(name), []).append(name)
     each = dict.fromkeys(name for first in wanted for name in by_name.get(_of_first(first), ()))
-    return [_picture(stage, name, drawn[name]) for name in each]
+    return [_picture(stage, name, drawn[name]) for name in each if _of_first(name) not in without]
 
 
 def _of_first(name: str) -> str:

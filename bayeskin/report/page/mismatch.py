@@ -8,15 +8,12 @@ from typing import Any
 from bayeskin.number_format import number, percent, quantity, unit_text
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
+from bayeskin.report.page.markers import marker_blocks
 from bayeskin.report.page.parts import Block, Cell, Folded, Heading, Section, Table, Text, row
 from bayeskin.report.page.sections import absent, cell
-from bayeskin.report.words import faint_in_words, full_run_in_words, informed_in_words
+from bayeskin.report.words import full_run_in_words, informed_in_words
 
-_VERDICTS = {
-    "nothing-missing": "The recording shows no physics that the model leaves out.",
-    "named": "The recording shows physics that the model leaves out, and it has been named.",
-    "unknown": "The model leaves something out, but no mechanism is likely enough to be named.",
-}
+_ON_SKIN = {"before": "on_skin_before", "after": "on_skin_after"}
 
 
 def mismatch(facts: RunFacts) -> Section:
@@ -24,14 +21,13 @@ def mismatch(facts: RunFacts) -> Section:
     diagnosis = facts.said("diagnose")
     blocks: list[Block] = list(absent(facts, "diagnose"))
     if diagnosis:
-        blocks.append(Text([" ".join([_VERDICTS[diagnosis["verdict"]], *faint_in_words(diagnosis)])]))
         if diagnosis["mechanisms"]:
             blocks.append(_mechanisms(diagnosis["mechanisms"]))
         if diagnosis["recordings"]:
             blocks.append(_recordings(diagnosis["recordings"]))
             blocks.append(Text([f"{informed_in_words(recording)}." for recording in diagnosis["recordings"]]))
         blocks += [_fits(diagnosis["fit"]), Text([full_run_in_words(diagnosis["full_model"])])]
-        blocks += pictures(facts, "diagnose")
+        blocks += [*pictures(facts, "diagnose", without=_ON_SKIN.values()), *_on_skin(facts, diagnosis)]
         if diagnosis["mechanisms"]:
             blocks.append(Folded("Parameters of the mechanisms", [_parameters(diagnosis["mechanisms"])]))
         blocks += [
@@ -44,6 +40,14 @@ def mismatch(facts: RunFacts) -> Section:
             *_experiments(facts),
         ]
     return Section("mismatch", "Mismatch", blocks)
+
+
+def _on_skin(facts: RunFacts, diagnosis: Mapping[str, Any]) -> list[Block]:
+    """Returns blocks about the markers before and after; both are the same where no mechanism acts."""
+    labels = [label for label in _ON_SKIN if label == "after" or diagnosis["best_set"]]
+    shown = {label: diagnosis["fit"][label] for label in labels}
+    fits = {label: fit["on_skin"] for label, fit in shown.items() if "on_skin" in fit}
+    return marker_blocks(fits, pictures(facts, "diagnose", [_ON_SKIN[label] for label in fits]))
 
 
 def _mechanisms(named: Sequence[Mapping[str, Any]]) -> Table:

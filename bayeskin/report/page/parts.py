@@ -87,7 +87,10 @@ class Source:
 
 @dataclass(frozen=True)
 class Key:
-    """Holds an entry of a chart's legend; `mark` is "dots", "line", "dashed", "band" or a "phase"."""
+    """Holds an entry of a chart's legend.
+
+    mark : "dots", "line", "before", "dashed", "band", "window" or a "phase"
+    """
 
     text: str
     mark: str
@@ -96,7 +99,10 @@ class Key:
 
 @dataclass(frozen=True)
 class Chart:
-    """Holds a plot over time that can be enlarged: its drawing, and the data that the cross-hair shows."""
+    """Holds a plot over time that can be enlarged: its drawing, and the data that the cross-hair shows.
+
+    screen : "wide" or "narrow" for a plot that only such a screen shows, "" for any other
+    """
 
     key: str
     title: str
@@ -104,6 +110,7 @@ class Chart:
     data: Mapping[str, Any]
     alt: str
     keys: Sequence[Key]
+    screen: str = ""
 
 
 Block = Heading | Table | Picture | Facts | Text | Missing | Folded | Source | Chart
@@ -156,7 +163,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Answer:
-    """Holds the answers to a reader's first questions: parameters, trust in them, and missing physics."""
+    """Holds the answers to a reader's first questions: parameters, trust in them, and missing physics.
+
+    missing : the verdict and the three sentences of the diagnosis, if one was made
+    """
 
     parameters: Sequence[ParameterSummary]
     material: Verdict

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -13,9 +14,23 @@ from numpy.typing import NDArray
 from bayeskin.report.timeline import runs_of
 from bayeskin.types import Array
 
-WIDTH, HEIGHT = 760, 320
-LEFT, RIGHT, TOP, BOTTOM = 54, 10, 24, 40
 Phases = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The size of a drawing, and the edges of a plot in it, in units of the drawing.
+
+    ticks : largest numbers of intervals on the axis of time and on the other axis
+    """
+
+    width: int = 760
+    height: int = 320
+    left: int = 54
+    right: int = 750
+    top: int = 24
+    bottom: int = 280
+    ticks: tuple[int, int] = (8, 6)
 
 
 class Plot:
@@ -24,9 +39,9 @@ class Plot:
     It holds the scales that turn seconds and values into units of the drawing.
     """
 
-    def __init__(self, time_s: Array, values: Sequence[Array]) -> None:
+    def __init__(self, time_s: Array, values: Sequence[Array], frame: Frame = Frame()) -> None:
         """Chooses scales that show all `values`, (m,) each, at the times (m,) [s]. NaN is not drawn."""
-        self.time_s = time_s
+        self.time_s, self.frame = time_s, frame
         self.t0, self.t1 = float(time_s[0]), float(time_s[-1])
         all_values = np.concatenate(values)
         low, high = float(np.nanmin(all_values)), float(np.nanmax(all_values))
@@ -35,22 +50,17 @@ class Plot:
 
     def x(self, time_s: Any) -> Any:
         """Returns the horizontal positions of times [s], same shape."""
-        return LEFT + (np.asarray(time_s) - self.t0) / ((self.t1 - self.t0) or 1.0) * (WIDTH - LEFT - RIGHT)
+        left, right = self.frame.left, self.frame.right
+        return left + (np.asarray(time_s) - self.t0) / ((self.t1 - self.t0) or 1.0) * (right - left)
 
     def y(self, values: Any) -> Any:
         """Returns the vertical positions of values, same shape."""
         share = (np.asarray(values) - self.low) / (self.high - self.low)
-        return HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM)
+        return self.frame.bottom - share * (self.frame.bottom - self.frame.top)
 
     def svg(self, key: str, label: str, phases: Phases, parts: Sequence[str], dots: int) -> str:
         """Returns the whole drawing: phases, axes, `parts` over them, and a cross-hair with `dots` dots."""
-        circles = '<circle r="4"/>' * dots
-        cross = f'<g class="cross"><line class="hair"/>{circles}</g>'
-        inner = "".join((self._phases(phases), self._axes(label), *parts, cross))
-        return (
-            f'<svg id="{key}" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" '
-            f'role="img" aria-labelledby="{key}-alt">{inner}</svg>'
-        )
+        return drawing(key, self.frame, "".join((self._phases(phases), self.axes(label), *parts)), dots)
 
     def numbers(self, marked: Sequence[Array], says: Sequence[str]) -> dict[str, Any]:
         """Returns the data of the cross-hair at each time: its position, its dots, and its text.
@@ -60,7 +70,7 @@ class Plot:
         dots = [[None if np.isnan(v) else round(float(v), 1) for v in self.y(values)] for values in marked]
         return {
             "x": np.round(self.x(self.time_s), 1).tolist(), "dots": dots, "says": list(says),
-            "top": TOP, "bottom": HEIGHT - BOTTOM, "width": WIDTH,
+            "top": self.frame.top, "bottom": self.frame.bottom, "width": self.frame.width,
         }  # fmt: skip
 
     def line(self, values: Array, name: str, color: str = "") -> str:
@@ -72,6 +82,14 @@ class Plot:
         """Returns a band between two values (m,) over time."""
         around = np.concatenate([self.time_s, self.time_s[::-1]]), np.concatenate([high, low[::-1]])
         return f'<path class="band {name}" d="{self._path(*around)}Z"/>'
+
+    def span(self, start_s: float, end_s: float, name: str, strength: float = 1.0) -> str:
+        """Returns a rectangle between two times, as high as the plot; `strength` is a share of its colour."""
+        x0, x1 = np.clip(self.x([start_s, end_s]), self.frame.left, self.frame.right)
+        top, bottom = self.frame.top, self.frame.bottom
+        size = f'width="{max(x1 - x0, 0.0):.1f}" height="{bottom - top}"'
+        size += f' fill-opacity="{0.25 + 0.75 * strength:.2f}"' if strength < 1.0 else ""
+        return f'<rect class="{escape(name)}" x="{x0:.1f}" y="{top}" {size}/>'
 
     def dots(self, values: Array, chosen: NDArray[np.bool_], name: str) -> str:
         """Returns the chosen points as a path of lines without length, which round line caps make visible."""
@@ -88,31 +106,38 @@ class Plot:
         return "".join(pieces)
 
     def _phases(self, phases: Phases) -> str:
-        tinted = [
-            f'<rect class="phase {escape(p["kind"])}" x="{a:.1f}" y="{TOP}" width="{max(b - a, 0.0):.1f}" '
-            f'height="{HEIGHT - TOP - BOTTOM}"/>'
-            for p in phases
-            if p["kind"] != "rest"
-            for a, b in [np.clip(self.x([p["start_s"], p["end_s"]]), LEFT, WIDTH - RIGHT)]
-        ]
-        return "".join(tinted)
+        shown = [phase for phase in phases if phase["kind"] != "rest"]
+        return "".join(self.span(p["start_s"], p["end_s"], f"phase {p['kind']}") for p in shown)
 
-    def _axes(self, label: str) -> str:
-        bottom = HEIGHT - BOTTOM
-        parts = [f'<line class="axis" x1="{LEFT}" y1="{bottom}" x2="{WIDTH - RIGHT}" y2="{bottom}"/>']
-        for tick in _ticks(self.t0, self.t1, 8):
+    def axes(self, label: str, timed: bool = True) -> str:
+        """Returns the axes; the axis of time has its numbers and its name if it is `timed`."""
+        frame = self.frame
+        left, right, bottom = frame.left, frame.right, frame.bottom
+        parts = [f'<line class="axis" x1="{left}" y1="{bottom}" x2="{right}" y2="{bottom}"/>']
+        for tick in _ticks(self.t0, self.t1, frame.ticks[0]) if timed else ():
             x = self.x(tick)
             parts.append(f'<line class="axis" x1="{x:.1f}" y1="{bottom}" x2="{x:.1f}" y2="{bottom + 4}"/>')
             parts.append(f'<text x="{x:.1f}" y="{bottom + 17}" text-anchor="middle">{tick:g}</text>')
-        for tick in _ticks(self.low, self.high, 6):
+        for tick in _ticks(self.low, self.high, frame.ticks[1]):
             y = self.y(tick)
-            parts.append(f'<line class="grid" x1="{LEFT}" y1="{y:.1f}" x2="{WIDTH - RIGHT}" y2="{y:.1f}"/>')
+            parts.append(f'<line class="grid" x1="{left}" y1="{y:.1f}" x2="{right}" y2="{y:.1f}"/>')
             tick_label = f"{tick:g}".replace("-", "−")
-            parts.append(f'<text x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{tick_label}</text>')
-        middle = 0.5 * (LEFT + WIDTH - RIGHT)
-        parts.append(f'<text x="{middle}" y="{HEIGHT - 4}" text-anchor="middle">time [s]</text>')
-        parts.append(f'<text x="4" y="{TOP - 9}">{label}</text>')
+            parts.append(f'<text x="{left - 7}" y="{y + 4:.1f}" text-anchor="end">{tick_label}</text>')
+        if timed:
+            middle = 0.5 * (left + right)
+            parts.append(f'<text x="{middle}" y="{frame.height - 4}" text-anchor="middle">time [s]</text>')
+        parts.append(f'<text x="4" y="{frame.top - 9}">{label}</text>')
         return "".join(parts)
+
+
+def drawing(key: str, frame: Frame, inner: str, dots: int) -> str:
+    """Returns an SVG of the size of a frame with drawn parts, and with a cross-hair of `dots` dots."""
+    circles = '<circle r="4"/>' * dots
+    cross = f'<g class="cross"><line class="hair"/>{circles}</g>'
+    return (
+        f'<svg id="{key}" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {frame.width} {frame.height}" '
+        f'role="img" aria-labelledby="{key}-alt">{inner}{cross}</svg>'
+    )
 
 
 def moments(time_s: Array, phases: Phases) -> Iterator[str]:

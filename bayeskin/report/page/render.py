@@ -13,23 +13,27 @@ from markupsafe import Markup
 from bayeskin.report.page import checks, indices, mismatch, sections
 from bayeskin.report.page.answer import answer
 from bayeskin.report.page.facts import RunFacts
+from bayeskin.report.page.overview import overview_charts
 from bayeskin.report.page.parts import Block, Section
 from bayeskin.report.page.prose import prose
 from bayeskin.report.page.study import StudyFacts, study_picture, study_sections, study_verdict
 
+MATERIAL = "What is this skin made of?"
 _HERE = Path(__file__).parent
 
 
 def render_page(facts: RunFacts) -> str:
     """Returns one HTML document that loads nothing: it contains all text, figures, style and script.
 
+    A page with a diagnosis begins with its verdict, one figure and three sentences.
     All text from a configuration or a recording is escaped. The page allows its own script only, which it
     identifies by a hash. The same facts give the same bytes.
     """
-    question = "What is this skin made of?"
+    said, diagnosed = answer(facts), bool(facts.said("diagnose"))
     return _rendered(
-        "page.html", facts=facts, question=question, answer=answer(facts), sections=_sections(facts)
-    )
+        "page.html", facts=facts, question=said.missing.word if diagnosed else MATERIAL, material=MATERIAL,
+        diagnosed=diagnosed, charts=overview_charts(facts), answer=said, sections=_sections(facts),
+    )  # fmt: skip
 
 
 def render_study(facts: StudyFacts) -> str:
@@ -74,9 +78,14 @@ def _rendered(template: str, **parts: Any) -> str:
 
 
 def _sections(facts: RunFacts) -> list[Section]:
-    upper = (sections.recording, sections.fit, sections.posterior, indices.sobol)
-    lower = (mismatch.mismatch, checks.checks, checks.provenance)
-    return [make(facts) for make in (*upper, *lower)]
+    """Returns the sections of the page, which begin with the diagnosis if one was made."""
+    calibration = (sections.fit, sections.posterior, indices.sobol) if facts.calibrated else ()
+    checked = (checks.checks,) if facts.calibrated else ()
+    if facts.said("diagnose"):
+        order = (mismatch.mismatch, sections.recording, *calibration, *checked, checks.provenance)
+    else:
+        order = (sections.recording, *calibration, mismatch.mismatch, *checked, checks.provenance)
+    return [make(facts) for make in order]
 
 
 def _kind(block: Block) -> str:

@@ -9,6 +9,7 @@ from bayeskin.number_format import interval, number, percent, quantity, scale
 from bayeskin.report.page.charts import history_chart, residual_chart
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
+from bayeskin.report.page.markers import marker_blocks
 from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Missing, Section, Table, Text, row
 from bayeskin.report.words import prior_in_words
 
@@ -101,6 +102,8 @@ def fit(facts: RunFacts) -> Section:
         tables = {"posterior mean": summary["rmse"], "full model, most probable point": None}
         tables["full model, most probable point"] = facts.said("map").get("rmse_of_full_model")
         blocks += [_rmse(tables), _bands(summary), *pictures(facts, "sample", ["fit"])]
+        markers = {"fit": summary["on_skin"]} if "on_skin" in summary else {}
+        blocks += marker_blocks(markers, pictures(facts, "sample", ["on_skin"]))
     return Section("fit", "Fit", blocks)
 
 

@@ -21,6 +21,7 @@ from bayeskin.report.page.parts import (
     row,
 )
 from bayeskin.report.page.svg import inline_svg
+from bayeskin.report.words import markers_unused_in_words
 
 FIGURES = {
     "population": (
@@ -200,6 +201,8 @@ def _recordings(facts: StudyFacts) -> Section:
         ],
     )
     blocks: list[Block] = [*study_picture(facts, "recordings"), table]
+    if unused := facts.answer.get("markers_unused"):
+        blocks.append(Text([markers_unused_in_words("a study", unused)]))
     if reasons := facts.answer["left_out"]:
         listed = [f"{name}: {reason}" for name, reason in reasons.items()]
         blocks.insert(0, Text(["These recordings are left out:"]))
