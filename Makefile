@@ -11,6 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: run test docs test-oldest test-wheel
 run: $(VENV)/.installed
 	$(VENV)/bin/bayeskin run runs/demo.toml
+	$(VENV)/bin/bayeskin diagnose runs/demo.toml
 
 test: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff check
@@ -48,3 +49,4 @@ test-wheel:
 	.venv-wheel/bin/python -m pip wheel --quiet --no-deps --wheel-dir .venv-wheel/dist .
 	.venv-wheel/bin/python -m pip install --quiet .venv-wheel/dist/*.whl
 	cd .venv-wheel && bin/bayeskin doctor && bin/bayeskin new && bin/bayeskin run demo.toml
+	cd .venv-wheel && bin/bayeskin diagnose demo.toml

@@ -5,7 +5,7 @@ Analysis). Parameters are drawn from the prior, a recording is made with them, a
 The rank of the true value among the posterior draws is uniform if likelihood, sampler and stopping rule are
 right. The table also has the share of true values inside the 50 % and 90 % intervals, and the share of the
 bins of a fresh recording at the same parameters inside the 50 % and 90 % bands. The recordings have the
-protocol of the demo, restricted to its first loading and hold (80 bins of 0.5 s). Surrogate, noise priors and
+protocol of the demo, restricted to its loading and hold (70 bins of 0.5 s). Surrogate, noise priors and
 convergence limits are the shipped ones; each posterior gives 100 draws.
 
     python benchmarks/calibration.py                     # 300 recordings made by the surrogate with its error
@@ -47,7 +47,7 @@ from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import Array
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
-WINDOW_S = ((5.0, 45.0),)
+WINDOW_S = ((5.0, 40.0),)
 DRAWS = 100
 SETTINGS = SampleSettings(2, 40, 8000, Limits(effective_samples=1000.0))
 NAMES = ("E_c", "E_s", "k_c", "k_s", "p_init", "sd_load", "sd_hold", "tau_noise", "nu_noise")

@@ -1,9 +1,10 @@
-"""Makes the figures of docs/gallery.md that show the demo: its run, and the fields inside the skin.
+"""Makes the figures of docs/gallery.md that show the demo: its run, its diagnosis, fields inside the skin.
 
     python benchmarks/demo_gallery.py
 
-The program runs `bayeskin run runs/demo.toml`, which skips finished stages, and `bayeskin simulate
---figures`. It copies their figures to docs/figures/demo-*.png, reduced to 256 colours.
+The program runs `bayeskin run runs/demo.toml` and `bayeskin diagnose runs/demo.toml`, which skip finished
+stages, and `bayeskin simulate --figures`. It copies their figures to docs/figures/demo-*.png, reduced to 256
+colours.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ FIGURES = ROOT / "docs" / "figures"
 OF_THE_RUN = (
     "recording/recording", "train/prior_predictive", "train/validation", "map/map_check", "sample/fit",
     "sample/posterior", "sample/profiles", "sample/traces", "sample/residuals", "sobol/sobol_prior_gp",
+    "diagnose/before_after",
 )  # fmt: skip
 
 
@@ -44,6 +46,7 @@ def smaller(path: Path, target: Path) -> None:
 
 def main() -> None:
     called("run", "runs/demo.toml")
+    called("diagnose", "runs/demo.toml")
     with tempfile.TemporaryDirectory() as folder:
         called("simulate", "-o", f"{folder}/force.csv", "--figures", folder)
         figures = [Path(folder) / "fields.png"]

@@ -1,6 +1,11 @@
-"""Makes data/demo.h5: the full model on a finer mesh than the shipped surrogate's, plus noise.
+"""Makes data/demo.h5: the full model on a finer mesh than the inference uses, concealed friction, and noise.
 
 Run from the repository's root: ``python data/make_demo.py``. What it draws is stated in data/README.md.
+
+The slide that carries the pads has dry friction. Its law is not the one that `bayeskin diagnose` knows, where
+friction approaches its limit exponentially (Dahl). It is a Coulomb slider behind a linear spring: friction
+grows linearly with the travel, and then stays at its limit.
+Source: W. Iwan, A distributed-element model for hysteresis, J. Appl. Mech. 33 (1966), 893-900.
 """
 
 from __future__ import annotations
@@ -13,16 +18,29 @@ from scipy.signal import lfilter
 
 from bayeskin import storage
 from bayeskin.finite_element import ModelSpec, simulate
-from bayeskin.types import PadMotion, Recording
+from bayeskin.types import Array, PadMotion, Recording
 
 TRUTH = {"E_c": 60e3, "E_s": 15e3, "k_c": 2e-14, "k_s": 8e-13, "p_init": 700.0}
-CORNERS_S = np.array([0.0, 5.0, 14.4, 45.0, 54.4, 65.0, 74.4, 105.0, 114.4, 130.0])
-HEIGHTS_M = 1e-3 * np.array([0.0, 0.0, 9.4, 9.4, 0.0, 0.0, 9.4, 9.4, 0.0, 0.0])
+CORNERS_S = np.array([0.0, 5.0, 14.0, 40.0, 49.0, 60.0])
+HEIGHTS_M = 1e-3 * np.array([0.0, 0.0, 9.0, 9.0, 0.0, 0.0])
 RATE_HZ = 50.0
+FRICTION_N, PRESLIDING_M = 0.04, 1.5e-4  # limit of the friction, and travel after which it slides
 WHITE_N, SLOW_N, SLOW_S = 4e-3, 4e-3, 0.5  # white noise, and correlated noise with its time
 SPIKES_PER_S, SPIKE_N = 0.1, 0.03  # one-sided: always upwards
 LVDT_STEP_M = 1e-5
 SEED = 20
+
+
+def friction(displacement_m: Array) -> Array:
+    """Returns the force [N] of the Coulomb slider behind its spring, which is at rest and relaxed at first.
+
+    displacement_m (n,) : displacement of the slide, in steps that are short beside the presliding length
+    """
+    force_n = np.zeros(len(displacement_m))
+    for i, step_m in enumerate(np.diff(displacement_m)):
+        trial_n = force_n[i] + FRICTION_N * step_m / PRESLIDING_M
+        force_n[i + 1] = np.clip(trial_n, -FRICTION_N, FRICTION_N)
+    return force_n
 
 
 def main() -> None:
@@ -36,7 +54,8 @@ def main() -> None:
     keep = np.exp(-1.0 / (RATE_HZ * SLOW_S))
     slow = SLOW_N * np.sqrt(1 - keep**2) * lfilter([1.0], [1.0, -keep], rng.standard_normal(n))
     spikes = SPIKE_N * rng.exponential(size=n) * (rng.random(n) < SPIKES_PER_S / RATE_HZ)
-    force_n = simulation.at(time_s) + WHITE_N * rng.standard_normal(n) + slow + spikes
+    measured_n = simulation.at(time_s) + friction(motion.at(time_s))
+    force_n = measured_n + WHITE_N * rng.standard_normal(n) + slow + spikes
     recording = Recording(
         time_s=time_s,
         displacement_m=LVDT_STEP_M * np.round(motion.at(time_s) / LVDT_STEP_M),

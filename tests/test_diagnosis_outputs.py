@@ -167,8 +167,8 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     }  # fmt: skip
     words = in_words(answer)
     assert "an unnamed smooth discrepancy: probability 0.97" in words
-    assert tuple(words.splitlines()[-3:]) == conclusion_of(answer).sentences
-    assert words.splitlines()[-4] == f"{conclusion_of(answer).verdict}."
+    assert words.splitlines()[-4:] == [*conclusion_of(answer).sentences, "report: x"]
+    assert words.splitlines()[-5] == f"{conclusion_of(answer).verdict}."
     assert "an RMSE of 2.5 mN. The fitted model differs from it by 0.4 mN there." in words
     assert "The intervals are" not in words
     rough = {**answer, "fit": {"before": fits, "after": {**fits, "sampled": {"settled": False}}}}

@@ -54,14 +54,14 @@ def own(tmp_path: Path) -> Path:
 def test_a_known_protocol_takes_the_shipped_surrogate_and_the_design_stage_accepts_it(demo: Path) -> None:
     out = demo.parent.parent / "forearm.toml"
     said = new_config([demo], out)
-    assert (said["out"], said["surrogate"], said["cycles"]) == (str(out), "demo.h5", 2)
+    assert (said["out"], said["surrogate"], said["cycles"]) == (str(out), "demo.h5", 1)
     assert load_config(out) == Config(
         name="forearm",
         recording=RecordingConfig(file="data/forearm.h5"),
         surrogate={"file": "demo.h5"},
     )
     assert open_run(out, Silent()).beside("data/forearm.h5").samefile(demo)
-    assert "#   demo: 6501 samples at 50 Hz" in out.read_text()
+    assert "#   demo: 3001 samples at 50 Hz" in out.read_text()
     manifest = load_manifest(shipped("surrogates/demo.h5"))
     assert stages.run(out, "design", Silent())["training"] == manifest["training_rows"]
 

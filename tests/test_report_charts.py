@@ -67,9 +67,11 @@ def test_sobol_indices_over_time_can_be_read() -> None:
         ("sd_hold (correlation −1)", "<i>σ</i><sub>hold</sub> (correlation −1)"),
         ("-5e+04 Pa in 60.25 s, 2026-11-23", "-5e+04 Pa in 60.25 s, 2026-11-23"),
         ("see runs/x_one.toml & <b>", "see runs/x_one.toml &amp; &lt;b&gt;"),
+        ("`run E_c <b>` finds E_c", "<code>run E_c &lt;b&gt;</code> finds <i>E</i><sub>c</sub>"),
+        ("a ` alone", "a ` alone"),
     ],
 )
-def test_names_in_sentences_are_symbols_and_nothing_else_changes(said: str, printed: str) -> None:
+def test_names_in_sentences_are_symbols_and_commands_are_code(said: str, printed: str) -> None:
     assert str(prose(said)) == printed
 
 

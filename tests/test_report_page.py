@@ -134,6 +134,15 @@ def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
     assert "The full model fails at the best values: the skin folds" in failed
 
 
+def test_the_held_out_error_has_a_column_where_there_is_one() -> None:
+    assert "held out: after the second hold" not in diagnosed_as({})
+    fit = summaries()["diagnose"]["fit"]
+    tested = {when: {**said, "rmse_held_out": 0.0312} for when, said in fit.items()}
+    text = diagnosed_as({"fit": tested, "held_out_set": ["device-friction"]})
+    assert "held out: after the second hold" in text
+    assert "31.2 mN" in text.replace("\N{NO-BREAK SPACE}", " ")
+
+
 def test_each_of_several_recordings_stands_beside_the_others() -> None:
     entry = {"rms_n": 2e-3, "noise_n": 1e-3, "sd_alone": {"E_c": 0.1}, "widens": {"E_c": 2.5}}
     text = diagnosed_as({"recordings": [
@@ -239,6 +248,19 @@ def test_figures_of_further_recordings_follow_that_of_the_first() -> None:
     fits = pictures(both, "sample", ["fit"])
     assert [picture.title for picture in fits[1:]] == [f"{fits[0].title}, recording {n}" for n in (2, 10)]
     assert len(pictures(run, "sample", ["fit"])) == 1
+
+
+def test_a_diagnosis_alone_that_failed_says_why_and_names_no_command_for_a_configuration() -> None:
+    run = facts(config_text="", config_path="arm.h5")
+    failed = StageFacts("diagnose", "failed", 1.0, {"ok": False, "message": "no set could be assessed"})
+    stages = {"recording": run.stages["recording"], "diagnose": failed}
+    page = render_page(dataclasses.replace(run, stages=stages, history=None, indices={}, forces=()))
+    text = Walk(page).text()
+    assert '<h1 id="question">What is missing?</h1>' in page
+    assert "The stage diagnose failed: no set could be assessed." in text
+    assert "bayeskin diagnose" not in text
+    assert "What is this skin made of?" not in text
+    assert "stage sample" not in text
 
 
 def test_markers_are_shown_with_their_noise_and_what_they_add(whole: str) -> None:

@@ -7,12 +7,19 @@ that the command line starts quickly.
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
 from collections.abc import Sequence
 
-import click
+try:
+    import click
+
+    importlib.import_module("rich")
+except ModuleNotFoundError as _error:  # without these packages, not even `doctor` could say so
+    _pip = f"{sys.executable} -m pip install {_error.name}"
+    sys.exit(f"bayeskin: the package {_error.name} is not installed; run `{_pip}`")
 
 import bayeskin
 from bayeskin.cli.app import app
@@ -64,9 +71,9 @@ def cli() -> None:
     \b
     Start here:
       bayeskin doctor                          check the installation
-      bayeskin new && bayeskin run demo.toml   run all stages on the demo
+      bayeskin new && bayeskin run demo.toml   fit the demo
+      bayeskin diagnose demo.toml              name what is concealed in it
       bayeskin new test.xlsx -o test.toml      write your own configuration
-      bayeskin run test.toml                   run all stages on it
 
     \b
     This line makes your shell complete commands and options (zsh: zsh_source):

@@ -10,14 +10,15 @@ from bayeskin.report.words import agreement_in_words, full_run_in_words, informe
 
 
 def in_words(answer: Mapping[str, Any]) -> str:
-    """Returns the answer as text, which ends with the three sentences of its conclusion."""
+    """Returns the answer as text, which ends with the sentences of its conclusion and with the page."""
     lines = [f"verdict: {answer['verdict']}"]
     lines += [f"  {mechanism['name']} (probability {mechanism['probability']:.2f}): {mechanism['statement']}"
               for mechanism in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
     lines.append(f"  an unnamed smooth discrepancy: probability {answer['smooth_probability']:.2f}")
+    windows = len(answer["located"])
     lines.append(
-        f"The model deviates from the recording in {len(answer['located'])} windows, "
+        f"The model deviates from the recording in {windows} window{'s' * (windows != 1)}, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
     )
     for recording in answer["recordings"]:
@@ -33,6 +34,6 @@ def in_words(answer: Mapping[str, Any]) -> str:
     )
     if best:
         lines.append(f"gain of log-evidence by single mechanisms: {best}")
-    lines += [f"outputs in {answer['folder']}", f"report: {answer['page']}"]
     conclusion = conclusion_of(answer)
-    return "\n".join([*lines, f"{conclusion.verdict}.", *conclusion.sentences])
+    lines += [f"outputs in {answer['folder']}", f"{conclusion.verdict}.", *conclusion.sentences]
+    return "\n".join([*lines, f"report: {answer['page']}"])

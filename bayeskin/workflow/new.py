@@ -110,7 +110,8 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     out.parent.mkdir(parents=True, exist_ok=True)
     recording.write_bytes(shipped("data/demo.h5").read_bytes())
     out.write_text(text.replace('"../data/demo.h5"', '"demo-recording.h5"'), encoding="utf-8")
-    return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})
+    commands = f"bayeskin run {out} && bayeskin diagnose {out}"
+    return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: {commands}"})
 
 
 def _refuse_names(references: Sequence[str]) -> None:

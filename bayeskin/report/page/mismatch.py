@@ -90,21 +90,22 @@ def _parameters(named: Sequence[Mapping[str, Any]]) -> Table:
 
 def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
     kinds = list(fit["before"]["rmse_by_phase"])
+    tested = any(summary["rmse_held_out"] is not None for summary in fit.values())
     rows = [
         row(
             (
                 when,
                 cell(summary["rmse"], "N"),
-                cell(summary["rmse_held_out"], "N"),
+                *([cell(summary["rmse_held_out"], "N")] if tested else []),
                 *(cell(summary["rmse_by_phase"].get(kind), "N") for kind in kinds),
                 Cell(percent(summary["coverage90"]), summary["coverage90"]),
             )
         )
         for when, summary in fit.items()
     ]
-    head = ("fit", "whole recording", "held out", *kinds, "90 % band holds")
-    title = "RMSE without and with the mechanisms; held out: after the second hold, by a fit to what precedes"
-    return Table(title, head, rows)
+    head = ("fit", "whole recording", *(["held out"] if tested else []), *kinds, "90 % band holds")
+    explained = "; held out: after the second hold, by a fit to what precedes" if tested else ""
+    return Table(f"RMSE without and with the mechanisms{explained}", head, rows)
 
 
 def _candidates(candidates: Sequence[Mapping[str, Any]]) -> Table:

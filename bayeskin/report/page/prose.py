@@ -1,4 +1,4 @@
-"""Prints the names of parameters in sentences as symbols."""
+"""Prints the names of parameters in sentences as symbols, and commands as code."""
 
 from __future__ import annotations
 
@@ -13,6 +13,17 @@ _NAME = re.compile(rf"(?<![\w./-])([A-Za-z]|{'|'.join(_GREEK)})_([a-z]\w*)(?![\w
 
 
 def prose(text: str) -> Markup:
+    """Returns escaped text in which the name ``E_c`` is a symbol, and what stands in backticks is code."""
+    pieces = text.split("`")
+    if len(pieces) % 2 == 0:  # a backtick without a partner is a character of the text
+        return _with_symbols(text)
+    return Markup().join(
+        Markup("<code>{}</code>").format(piece) if i % 2 else _with_symbols(piece)
+        for i, piece in enumerate(pieces)
+    )
+
+
+def _with_symbols(text: str) -> Markup:
     """Returns escaped text in which the name ``E_c`` is a symbol."""
     pieces, end = Markup(), 0
     for match in _NAME.finditer(text):
