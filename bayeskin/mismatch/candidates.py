@@ -38,10 +38,8 @@ class Candidates:
         self._shapes: dict[str, Values] = {}  # the keys are names of strength parameters
         self.expanded: set[Names] = set()
 
-    def fit_beside(self, current: SetFit, every: bool = False) -> list[Names]:
+    def fit_beside(self, current: SetFit) -> list[Names]:
         """Fits the most promising of the new sets that have one mechanism more, and returns these sets.
-
-        every : True to fit all new sets for which a test promises any gain
 
         A fit may fail, or end below the fit without the mechanism. It then starts again from the fit without
         the mechanism: with the mechanism's values of a run that finished, and then with a weaker mechanism.
@@ -54,7 +52,7 @@ class Candidates:
         least = settings.gain - VerdictSettings().log_odds  # a gain in evidence makes up for the odds
         if context.leaves_more_than_noise(current):
             least = settings.promised
-        chosen = order if every else [n for n in order if promised[n] > least][: settings.shortlist]
+        chosen = [name for name in order if promised[name] > least][: settings.shortlist]
         context.tell(
             "predicted gains: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5])
         )

@@ -10,8 +10,7 @@ remaining ones, at the tissue of this set.
 
 A mechanism that is not in the catalogue is imitated by several mechanisms of the catalogue, and each of these
 gains. The search therefore continues from a larger set only if one of its two hypotheses, alone or with an
-unnamed smooth discrepancy, is likelier than both hypotheses of the smaller set. Where the discrepancy is
-likelier than not at the end, every mechanism is fitted beside the most probable set.
+unnamed smooth discrepancy, is likelier than both hypotheses of the smaller set.
 
 At the end, higher maxima are searched for the sets that could become as likely as the most probable one, and
 mechanisms are added to those that are nearly as likely (`further_maxima`).
@@ -31,7 +30,7 @@ from bayeskin.mechanisms import Mechanism, without_one
 from bayeskin.mismatch.candidates import Candidates
 from bayeskin.mismatch.full_checks import check, check_likely_sets, checked_best, is_checked_nearby
 from bayeskin.mismatch.further_maxima import find_further_maxima, rivals
-from bayeskin.mismatch.hypotheses import Evidences, VerdictSettings, weight
+from bayeskin.mismatch.hypotheses import Evidences, weight
 from bayeskin.mismatch.search_context import SearchContext, Tell, correction, gained, title
 from bayeskin.mismatch.search_record import Names, SearchResult
 from bayeskin.mismatch.search_settings import SearchSettings
@@ -59,7 +58,6 @@ def search(
     searcher.fit_base_model()
     searcher.search_sets()
     searcher.weigh_likely_sets()
-    searcher.try_all_mechanisms()
     if context.record.evidences:
         find_further_maxima(context, searcher.weigh_likely_sets)
         if searcher.search_beside_rivals():
@@ -124,20 +122,6 @@ class Searcher:
             names = record.chosen
             check(self._context, [record.fits[names]])
             self._weigh([names])
-
-    def try_all_mechanisms(self) -> None:
-        """Fits every mechanism beside the most probable set where something without a name is probable.
-
-        A score test may promise hardly any gain for the missing mechanism, because the tissue is biased. So
-        all mechanisms are fitted before a mismatch stays without a name.
-        """
-        record = self._context.record
-        if record.evidences and record.family.smooth > VerdictSettings().likelier_than_not:
-            names = record.chosen
-            self._candidates.fit_beside(record.fits[names], every=True)
-            if self._beats_discrepancy(names):
-                self.search_sets()
-            self.weigh_likely_sets()
 
     def search_beside_rivals(self) -> bool:
         """Adds mechanisms to the rivals of the most probable set; returns whether there was one to add to.
