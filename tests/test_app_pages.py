@@ -14,6 +14,7 @@ import pytest
 from toys.app_page import DEVICE, Visitor, served, until
 from toys.external_models import PARAMETERS, SPRING
 from toys.finished_run import facts
+from toys.small_reduced import hollow
 from toys.small_study import SPRING_RUN, record
 
 from bayeskin.app import jobs
@@ -21,12 +22,13 @@ from bayeskin.app.comparison import RunAnswer, by_parameter, run_answer, table
 from bayeskin.app.devices import state
 from bayeskin.app.estimate import OVERRUN, SHIPPED_DESIGN_S, USUAL_S, seconds_left, usual_seconds
 from bayeskin.app.jobs import Job, State
-from bayeskin.app.pages import job_page, recordings_page
+from bayeskin.app.pages import job_page, recording_page, recordings_page
 from bayeskin.app.questions import CALIBRATE, MISSING, ask
 from bayeskin.app.recordings import RecordingFolder, open_recordings
 from bayeskin.app.steps import steps
 from bayeskin.config import config_of
 from bayeskin.config.device import DeviceFile
+from bayeskin.geometry import Geometry
 from bayeskin.shipped import shipped
 from bayeskin.workflow.diagnosis_progress import tell_tasks
 from bayeskin.workflow.engine import Silent, open_run, run_stages
@@ -152,6 +154,30 @@ def test_a_configuration_is_written_anew_only_if_what_it_is_made_of_has_changed(
         ask(folder, "calibrate")
         assert "# my own" not in folder.config.read_text()
         folder.config.write_text(own)
+
+
+def test_a_device_can_be_prepared_until_its_reduced_model_is_complete(tmp_path: Path) -> None:
+    recordings = open_recordings(tmp_path / "recordings")
+    folder = recordings.new("arm.h5")
+    (folder.path / "original").mkdir()
+    shutil.copy(shipped("data/demo.h5"), folder.stored)
+    offers = {}
+    for when, gauge_mm in (("article", 36), ("other", 30)):
+        state(folder, DeviceFile.model_validate({"device": {"gauge_mm": gauge_mm}}))
+        offers[when] = recording_page("/x", recordings, folder)
+    hollow(folder.path / "device-reduced.h5", Geometry(gauge_m=30e-3))
+    offers["complete"] = recording_page("/x", recordings, folder)
+    (folder.path / "device-reduced-training").mkdir()
+    offers["first version"] = recording_page("/x", recordings, folder)
+    offered = {
+        when: [f"/ask/{key}" in page for key in ("missing", "prepare")] for when, page in offers.items()
+    }
+    assert offered == {
+        "article": [True, False],
+        "other": [False, True],
+        "complete": [True, False],
+        "first version": [True, True],
+    }
 
 
 @pytest.mark.slow

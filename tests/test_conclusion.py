@@ -32,7 +32,9 @@ def test_the_largest_of_the_windows_is_stated_with_its_place_and_side() -> None:
         "the loading of cycle 1 (10 to 19 s), where it lies 36 mN below the model on average."
     )
     above = concluded(located=[{**hold, "recording": "second"}]).where
-    assert "in one time window (in holds), most in the hold of cycle 1 of second (10" in above
+    assert "differs from the model in one time window, the hold of cycle 1 of second (10 to 19 s)" in above
+    rest = {**WINDOW, "phase": "rest", "cycle": 0}
+    assert "one time window, the rest before the first loading (10 to" in concluded(located=[rest]).where
     assert above.endswith("it lies 4 mN above the model on average.")
     assert concluded(located=[]).where == (
         "The recorded force stays where the model allows it (RMS difference 80 mN)."

@@ -15,8 +15,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from toys.command_line import Command, assert_refused
 
-import bayeskin
+import bayeskin as package
 from bayeskin import cli, shipped
 from bayeskin.errors import InputError
 from bayeskin.execution.local import Lost
@@ -132,6 +133,28 @@ def test_a_package_that_is_absent_or_too_old_is_named(
     assert shown.splitlines()[-1] == "something is broken"
 
 
+@pytest.mark.parametrize("package", ["click", "rich"])
+def test_without_a_package_of_the_command_line_one_line_names_the_command(package: str) -> None:
+    script = f"import sys; sys.modules[{package!r}] = None; from bayeskin.cli import main"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    command = f"{sys.executable} -m pip install {package}"
+    assert done.returncode == 1
+    assert done.stderr == f"bayeskin: the package {package} is not installed; run `{command}`\n"
+
+
+def test_a_folder_that_was_removed_is_one_line(bayeskin: Command, tmp_path: Path) -> None:
+    (tmp_path / "gone").mkdir()
+    before = Path.cwd()
+    os.chdir(tmp_path / "gone")
+    try:
+        (tmp_path / "gone").rmdir()
+        assert_refused(
+            bayeskin("doctor"), "current folder: it does not exist any more; change to another: cd ~"
+        )
+    finally:
+        os.chdir(before)
+
+
 @pytest.mark.usefixtures("quick")
 def test_a_part_that_cannot_be_imported_is_a_finding_and_no_crash(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -168,7 +191,7 @@ def test_a_folder_without_room_or_access_is_told(tmp_path: Path, monkeypatch: py
 def test_bayeskin_is_installed_anew_from_where_it_came(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    checkout = Path(bayeskin.__file__).parent.parent
+    checkout = Path(package.__file__).parent.parent
     pip = f"{sys.executable} -m pip install --force-reinstall"
     assert remedies.reinstall() == f"{pip} --editable {checkout}"
     (tmp_path / "a b.whl").touch()

@@ -184,6 +184,7 @@ def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
 MIDDLE = 0.5 * (closed_form_reduced.EDGES_S[1:] + closed_form_reduced.EDGES_S[:-1])
 
 
+@pytest.mark.usefixtures("few_steps")
 def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

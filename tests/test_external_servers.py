@@ -40,6 +40,8 @@ from bayeskin.workflow.doctor_models import FULL_MODEL_N, THETA
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.serve import Asked, ServedModel, open_server
 
+POLL_S = 0.01  # between two looks of a server at whether it is to stop
+
 
 @pytest.fixture
 def case(tmp_path: Path) -> Path:
@@ -73,15 +75,15 @@ def umbridge_url() -> Iterator[str]:
     process.wait()
 
 
-@pytest.fixture
-def served(case: Path) -> Iterator[str]:
-    """`bayeskin serve` on the spring."""
-    yield from serving(case)
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """`bayeskin serve` on the spring; no request may change what it answers to the next."""
+    yield from serving(spring_case(tmp_path_factory.mktemp("served")))
 
 
 def serving(config: Path | None) -> Iterator[str]:
     listening, said = open_server(config, "127.0.0.1", 0, Silent())
-    threading.Thread(target=listening.serve_forever, daemon=True).start()
+    threading.Thread(target=listening.serve_forever, args=(POLL_S,), daemon=True).start()
     yield said["url"]
     listening.shutdown()
     listening.server_close()
@@ -262,7 +264,7 @@ def asked_raw(address, sent: bytes, reset: bool) -> socket.socket:
 def test_clients_that_misbehave_or_leave_print_nothing_at_the_server(capfd: pytest.CaptureFixture) -> None:
     model, before = Waiting(), set(threading.enumerate())
     listening = server(model, "127.0.0.1", 0)
-    serving = threading.Thread(target=listening.serve_forever, daemon=True)
+    serving = threading.Thread(target=listening.serve_forever, args=(POLL_S,), daemon=True)
     serving.start()
     body = b'{"name": "waiting", "input": [[1.0]]}'
     whole = b"POST /Evaluate HTTP/1.1\r\nContent-Length: %d\r\n\r\n" % len(body) + body
@@ -310,7 +312,7 @@ def test_a_server_that_goes_away_costs_no_finished_run_and_fails_none(tmp_path: 
 
     def start(port: int):
         served = server(Mortal(), "127.0.0.1", port)
-        threading.Thread(target=served.serve_forever, daemon=True).start()
+        threading.Thread(target=served.serve_forever, args=(POLL_S,), daemon=True).start()
         return served
 
     listening = start(0)

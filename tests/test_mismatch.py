@@ -73,7 +73,7 @@ def test_the_chance_of_the_farthest_window_is_uniform_where_nothing_is_missing()
 @pytest.mark.parametrize("share", [1e-3, 1e-2])
 def test_what_the_model_is_wrong_by_is_no_mismatch(share: float) -> None:
     """The model errs by another amount in each phase, with an allowed sd below and above the noise's."""
-    settings, chances = LocateSettings(mesh_error=share), []
+    settings, chances = LocateSettings(mesh_error=share, draws=400), []
     for seed in range(30):
         alone = concealing(seed)
         binned = alone.binned
@@ -235,7 +235,7 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
         skin = ToySurrogate(sd_n=1e-9)
         error = allowing(0.004 if allows else 0.0)
         alone = dataclasses.replace(right, binned=off, surrogate=skin, model_error=error)
-        resampled = resample(fitted(alone), 1)
+        resampled = resample(fitted(alone), 1, ResampleSettings(legs=(150,), modes=0))
         force = skin.predict(resampled.draws[:, : len(TRUTH)]).mean.max(axis=1)
         low, high = np.quantile(force, [0.05, 0.95])
         assert (low < truth < high) == inside, (low, truth, high)

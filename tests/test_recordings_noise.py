@@ -223,7 +223,7 @@ def test_jumps_that_are_there_are_allowed_and_others_are_refuted(
     interval_s: float, slow_mn: float, lasts_s: float
 ) -> None:
     refuted, time_s = [], interval_s * np.arange(round(130.0 / interval_s) + 1)
-    for seed in range(3):
+    for seed in range(1 if interval_s < 0.01 else 3):  # the finest recordings take longest
         rng = np.random.default_rng([seed, 6])
         times = np.array([25.0, 35.0, 85.0]) + rng.uniform(-0.4, 0.4, 3)
         sizes = np.array([0.015, -0.015, 0.03])

@@ -11,10 +11,11 @@ import pytest
 from toys.finished_run import FORCES, HISTORY, drawing, summaries
 
 from bayeskin import storage
+from bayeskin.report.conclusion import conclusion_of
 from bayeskin.report.page.figures import FIGURES
 from bayeskin.types import Recording
 from bayeskin.workflow import diagnosing, diagnosis, folder, page, stages
-from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage
+from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage, open_run, run_stages
 
 CONFIG = 'seed = {seed}\n[recording]\nfile = "r.csv"\n'
 
@@ -56,6 +57,13 @@ def test_a_run_ends_with_its_page_and_report_makes_it_again(tmp_path: Path) -> N
     assert said["page"] == str(path)
     first = path.read_bytes()
     assert b'id="sample-posterior"' in first
+    path.unlink()
+    assert said["text"].endswith(f"report: {path}")
+    run_stages(open_run(config, Silent()), stubs(), "diagnose")
+    lines = stages.run(config, None, Silent(), stubs())["text"].splitlines()
+    assert tuple(lines[-3:]) == conclusion_of(summaries()["diagnose"]).sentences
+    assert lines[-5:-3] == [f"report: {path}", "The model lacks device-friction."]
+    first = path.read_bytes()
     path.unlink()
     again = stages.report(config, Silent(), stubs())
     assert (again["ok"], again["page"]) == (True, str(path))

@@ -250,6 +250,19 @@ def test_figures_of_further_recordings_follow_that_of_the_first() -> None:
     assert len(pictures(run, "sample", ["fit"])) == 1
 
 
+def test_a_diagnosis_alone_that_failed_says_why_and_names_no_command_for_a_configuration() -> None:
+    run = facts(config_text="", config_path="arm.h5")
+    failed = StageFacts("diagnose", "failed", 1.0, {"ok": False, "message": "no set could be assessed"})
+    stages = {"recording": run.stages["recording"], "diagnose": failed}
+    page = render_page(dataclasses.replace(run, stages=stages, history=None, indices={}, forces=()))
+    text = Walk(page).text()
+    assert '<h1 id="question">What is missing?</h1>' in page
+    assert "The stage diagnose failed: no set could be assessed." in text
+    assert "bayeskin diagnose" not in text
+    assert "What is this skin made of?" not in text
+    assert "stage sample" not in text
+
+
 def test_markers_are_shown_with_their_noise_and_what_they_add(whole: str) -> None:
     text = Walk(whole).text()
     residual = (

@@ -38,7 +38,7 @@ def said() -> dict[str, Any]:
     """The names that the documentation's blocks leave, run on a coarse mesh and with coarse proposals."""
 
     def coarsely(spec: ModelSpec, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
-        return simulate(replace(spec, refinement=0), motion, theta)
+        return simulate(replace(spec, refinement=0, tolerance=1e-2), motion, theta)
 
     names: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:

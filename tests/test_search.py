@@ -42,7 +42,7 @@ def exact(values: Mapping[str, float]) -> Array:
     return closed_form_reduced.means(values)[0]
 
 
-FEW = SearchSettings(skins=8, starts=2, best=1, others=4, tried=1)
+FEW = SearchSettings(skins=8, starts=2, best=1, others=4, tried=1, alike=1, runs=6)
 QUICK = replace(FEW, ends=(), shapes=0)  # further maxima are sought from two starts only
 
 

@@ -7,12 +7,19 @@ that the command line starts quickly.
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
 from collections.abc import Sequence
 
-import click
+try:
+    import click
+
+    importlib.import_module("rich")
+except ModuleNotFoundError as _error:  # without these packages, not even `doctor` could say so
+    _pip = f"{sys.executable} -m pip install {_error.name}"
+    sys.exit(f"bayeskin: the package {_error.name} is not installed; run `{_pip}`")
 
 import bayeskin
 from bayeskin.cli.app import app

@@ -10,6 +10,7 @@ import click
 
 from bayeskin.cli.answers import answered
 from bayeskin.cli.terminal import Terminal
+from bayeskin.errors import InputError
 
 
 @click.command(short_help="Check that this installation works.")
@@ -29,5 +30,9 @@ def doctor() -> Mapping[str, Any]:
     """
     from bayeskin.workflow.doctor import examine
 
+    try:
+        folder = Path.cwd()
+    except FileNotFoundError:
+        raise InputError("current folder", "it does not exist any more", "change to another: cd ~") from None
     with Terminal() as terminal:
-        return examine(Path.cwd(), terminal)
+        return examine(folder, terminal)

@@ -76,19 +76,24 @@ def _where(answer: Mapping[str, Any]) -> str:
     if not windows:
         rmse = quantity(before["rmse"], "N", 2)
         return f"The recorded force stays where the model allows it (RMS difference {rmse}){skin}."
+    most = max(windows, key=lambda window: abs(window["mean_residual"]))
+    side = "above" if most["mean_residual"] > 0 else "below"
     kinds = {window["phase"] for window in windows}
     phases = listed([PHASE_IN_WORDS[kind] for kind in get_args(PhaseKind) if kind in kinds])
-    count = "one time window" if len(windows) == 1 else f"{len(windows)} time windows"
-    most = max(windows, key=lambda window: abs(window["mean_residual"]))
-    place = f"the {_PHASES[most['phase']]} of cycle {most['cycle']}"
-    if "recording" in most:
-        place += f" of {most['recording']}"
-    side = "above" if most["mean_residual"] > 0 else "below"
+    several = f"{len(windows)} time windows ({phases}), most in"
+    count = "one time window," if len(windows) == 1 else several
     return (
-        f"The recorded force differs from the model in {count} ({phases}), most in {place} "
-        f"({number(most['t0'])} to {number(most['t1'])} s), where it lies "
+        f"The recorded force differs from the model in {count} {_place(most)}, where it lies "
         f"{quantity(abs(most['mean_residual']), 'N', 2)} {side} the model on average{skin}."
     )
+
+
+def _place(window: Mapping[str, Any]) -> str:
+    """Returns phase, cycle and times of a window, and its recording if there are several."""
+    cycle = f"of cycle {window['cycle']}" if window["cycle"] else "before the first loading"
+    recording = f" of {window['recording']}" if "recording" in window else ""
+    times = f"{number(window['t0'])} to {number(window['t1'])} s"
+    return f"the {_PHASES[window['phase']]} {cycle}{recording} ({times})"
 
 
 def _on_skin(located: Mapping[str, Any] | None) -> str:

@@ -9,11 +9,13 @@ from typing import Any
 from bayeskin.config import Config
 from bayeskin.json_files import plain, write_json
 from bayeskin.number_format import at_edge
+from bayeskin.report.conclusion import conclusion_of
 from bayeskin.report.words import markers_in_words, polished_in_words, prior_in_words
 from bayeskin.workflow import design, diagnosis, indices, maximum, posterior, recording, training
 from bayeskin.workflow.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.workflow.executor import with_scheduler
 from bayeskin.workflow.folder import read_record
+from bayeskin.workflow.further_tests import judged_tests
 from bayeskin.workflow.page import write_page
 
 BEFORE_REPORT = (
@@ -119,7 +121,7 @@ def run(
     }
     if last in (None, "report"):
         document["page"] = write_page(opened, stages)
-        text += f"\nreport: {document['page']}"
+        text = "\n".join([text, f"report: {document['page']}", *_diagnosis_lines(opened, stages)])
     return plain({**document, "text": text})
 
 
@@ -148,6 +150,16 @@ def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None 
     failed = any(states[name] == "failed" for name in missing)
     document = {"ok": not failed, "stage": "report", "verdict": "not finished", "missing": missing}
     return plain({**document, "folder": opened.folder, "page": page, "text": text})
+
+
+def _diagnosis_lines(run: Run, stages: Mapping[str, Stage]) -> list[str]:
+    """Returns the verdict and the three sentences of a run's diagnosis; none where it is not done."""
+    state, record = standing(run, stages).get(diagnosis.NAME, ("not run", None))
+    if state != "done" or record is None:
+        return []
+    tests = judged_tests(run)
+    conclusion = conclusion_of(record.summary, None if tests is None else tests.summary)
+    return [f"{conclusion.verdict}.", *conclusion.sentences]
 
 
 def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str:

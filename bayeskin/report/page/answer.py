@@ -65,7 +65,7 @@ def _material_verdict(facts: RunFacts) -> Verdict:
     sampled = facts.stage("sample")
     if not sampled.done:
         reason = [f"The posterior has not been sampled: the stage sample is {sampled.standing}."]
-        return Verdict("not known yet", "none", reason, f"bayeskin run {facts.config_path}")
+        return Verdict("not known yet", "none", reason, facts.command("run"))
     ridges = facts.said("sample")["ridges"]
     lines = ["Posterior median and 90 % interval; the bar shows where they lie in the prior's range."]
     return Verdict("", "none", [*lines, *(f"{ridge}." for ridge in ridges)])
@@ -99,4 +99,4 @@ def _missing_physics(facts: RunFacts) -> Verdict:
         return Verdict(conclusion.verdict, "good" if nothing else "doubt", conclusion.sentences)
     standing = facts.stage("diagnose").standing
     reason = [f"The physics that is missing is not known: the stage diagnose is {standing}."]
-    return Verdict("not known yet", "none", reason, f"bayeskin diagnose {facts.config_path}")
+    return Verdict("not known yet", "none", reason, facts.command("diagnose"))

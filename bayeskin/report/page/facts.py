@@ -34,7 +34,7 @@ class StageFacts:
 class RunFacts:
     """Holds the facts of a run: its configuration, its provenance, and the state of its stages.
 
-    config_path : as a person would type it; config_text : content of that file
+    config_path : as a person would type it; config_text : content of that file, "" for recordings without one
     parameters : meaning of each parameter of the model, by name and in the model's order
     history : recorded bins and their prediction, as the stage `sample` writes them
     indices : Sobol' indices over time, by the name of their distribution, as the stage `sobol` writes them
@@ -68,6 +68,12 @@ class RunFacts:
     def calibrated(self) -> bool:
         """Returns whether the stages of a calibration belong to the page.
 
-        They do not where a diagnosis was made and nothing else was asked for.
+        They do not where a diagnosis was made and nothing else was asked for, and for recordings without a
+        configuration.
         """
-        return not self.said("diagnose") or self.stage("sample").standing != "not run"
+        diagnosed = bool(self.said("diagnose"))
+        return "sample" in self.stages and not (diagnosed and self.stage("sample").standing == "not run")
+
+    def command(self, stage: str) -> str:
+        """Returns the command that runs a stage, or "" for recordings without a configuration."""
+        return f"bayeskin {stage} {self.config_path}" if self.config_text else ""

@@ -18,7 +18,7 @@ from bayeskin.report.page.parts import Block, Section
 from bayeskin.report.page.prose import prose
 from bayeskin.report.page.study import StudyFacts, study_picture, study_sections, study_verdict
 
-MATERIAL = "What is this skin made of?"
+MATERIAL, MISSING = "What is this skin made of?", "What is missing?"
 _HERE = Path(__file__).parent
 
 
@@ -30,8 +30,9 @@ def render_page(facts: RunFacts) -> str:
     identifies by a hash. The same facts give the same bytes.
     """
     said, diagnosed = answer(facts), bool(facts.said("diagnose"))
+    question = MATERIAL if facts.calibrated else MISSING
     return _rendered(
-        "page.html", facts=facts, question=said.missing.word if diagnosed else MATERIAL, material=MATERIAL,
+        "page.html", facts=facts, question=said.missing.word if diagnosed else question, material=MATERIAL,
         diagnosed=diagnosed, charts=overview_charts(facts), answer=said, sections=_sections(facts),
     )  # fmt: skip
 

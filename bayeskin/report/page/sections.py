@@ -28,7 +28,7 @@ def absent(facts: RunFacts, stage: str) -> list[Block]:
         return []
     message = state.summary.get("message") if state.standing == "failed" else None
     reason = _WHY[state.standing] + (f": {message}" if message else "")
-    return [Missing(f"The stage {stage} {reason}.", f"bayeskin {stage} {facts.config_path}")]
+    return [Missing(f"The stage {stage} {reason}.", facts.command(stage))]
 
 
 def cell(value: float | None, unit: str) -> Cell:
