@@ -121,7 +121,7 @@ def run(
     }
     if last in (None, "report"):
         document["page"] = write_page(opened, stages)
-        text = "\n".join([text, f"report: {document['page']}", *_diagnosis_lines(opened, stages)])
+        text = "\n".join([text, *_diagnosis_lines(opened, stages), f"report: {document['page']}"])
     return plain({**document, "text": text})
 
 
