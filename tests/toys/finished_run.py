@@ -180,7 +180,8 @@ def summaries() -> dict[str, dict[str, Any]]:
             "fit": {
                 when: {"rmse": rmse, "rmse_by_phase": {"rest": rmse}, "rmse_held_out": None,
                        "coverage90": 0.9, "rmse_of_mean": rmse, "on_skin": ON_SKIN,
-                       "emulator": {"settled": True}, "sampled": {"settled": True}}
+                       "emulator": {"settled": True}, "sampled": {"settled": True},
+                       "theta": {"E_c": {"mean": 6e4, "sd": 1e4, "interval90": [4e4, 8e4]}}}
                 for when, rmse in (("before", 0.08), ("after", 0.0247))
             },
             "unexplained": {

@@ -68,7 +68,30 @@ def _material_verdict(facts: RunFacts) -> Verdict:
         return Verdict("not known yet", "none", reason, facts.command("run"))
     ridges = facts.said("sample")["ridges"]
     lines = ["Posterior median and 90 % interval; the bar shows where they lie in the prior's range."]
-    return Verdict("", "none", [*lines, *(f"{ridge}." for ridge in ridges)])
+    return Verdict("", "none", [*lines, *(f"{ridge}." for ridge in ridges), *_bias(facts)])
+
+
+def _bias(facts: RunFacts) -> list[str]:
+    """Returns sentences about the bias of the parameters by what the model lacks, with the corrected values.
+
+    The list is empty where nothing is known to be missing.
+    """
+    diagnosis = facts.said("diagnose")
+    if not diagnosis or diagnosis["verdict"] == "nothing-missing":
+        return []
+    if diagnosis["verdict"] == "unknown":
+        return ["The model lacks something without a name, which biases these values by an unknown amount."]
+    names = ", ".join(mechanism["name"] for mechanism in diagnosis["mechanisms"])
+    summaries, corrected = facts.said("sample")["parameters"], diagnosis["fit"]["after"]["theta"]
+    values = []
+    for name, summary in summaries.items():
+        if name in facts.parameters and name in corrected:
+            low, high = corrected[name]["interval90"]
+            values.append(f"{name} {interval(low, high, summary['unit'])}")
+    return [
+        f"These values are of the model without {names}, which biases them.",
+        f"With {names}, the 90 % intervals are: {'; '.join(values)}.",
+    ]
 
 
 def _trust_verdict(facts: RunFacts) -> Verdict:
