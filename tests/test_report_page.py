@@ -136,7 +136,7 @@ def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
 
 def test_the_values_are_said_to_be_biased_by_what_is_missing_and_corrected() -> None:
     text = diagnosed_as({}).replace("\N{NO-BREAK SPACE}", " ")
-    assert "These values are of the model without device-friction, which biases them." in text
+    assert "These values are of the model without device-friction; what it lacks biases them." in text
     assert "With device-friction, the 90 % intervals are: Ec 40 to 80 kPa." in text
     unknown = diagnosed_as({"verdict": "unknown", "mechanisms": []})
     assert "lacks something without a name, which biases these values by an unknown amount" in unknown

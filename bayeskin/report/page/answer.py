@@ -11,7 +11,7 @@ from typing import Any
 
 from bayeskin.inference.identify import Informed
 from bayeskin.number_format import interval, percent, quantity, scale, with_unit
-from bayeskin.report.conclusion import conclusion_of
+from bayeskin.report.conclusion import conclusion_of, listed
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.parts import Answer, Bar, ParameterSummary, Verdict
 from bayeskin.report.words import prior_in_words
@@ -81,7 +81,7 @@ def _bias(facts: RunFacts) -> list[str]:
         return []
     if diagnosis["verdict"] == "unknown":
         return ["The model lacks something without a name, which biases these values by an unknown amount."]
-    names = ", ".join(mechanism["name"] for mechanism in diagnosis["mechanisms"])
+    names = listed(diagnosis["best_set"])
     summaries, corrected = facts.said("sample")["parameters"], diagnosis["fit"]["after"]["theta"]
     values = []
     for name, summary in summaries.items():
@@ -89,7 +89,7 @@ def _bias(facts: RunFacts) -> list[str]:
             low, high = corrected[name]["interval90"]
             values.append(f"{name} {interval(low, high, summary['unit'])}")
     return [
-        f"These values are of the model without {names}, which biases them.",
+        f"These values are of the model without {names}; what it lacks biases them.",
         f"With {names}, the 90 % intervals are: {'; '.join(values)}.",
     ]
 
