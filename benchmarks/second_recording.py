@@ -39,10 +39,11 @@ from scipy.stats import binomtest
 
 import bayeskin.mismatch
 from bayeskin import storage
-from bayeskin.finite_element.problem import material
+from bayeskin.finite_element.problem import PARAMETERS, material
 from bayeskin.finite_element.simulate import simulate_on
 from bayeskin.geometry import Geometry
-from bayeskin.mechanisms import catalogue, laws, observed
+from bayeskin.mechanisms import catalogue, laws, observed, solved
+from bayeskin.mismatch.hypotheses import VerdictSettings
 from bayeskin.proof.conceal import CELL_STEP_N, LVDT_STEP_M, TOLERANCE, problem_of
 from bayeskin.types import PadMotion, Recording
 from bayeskin.workflow.diagnosing import diagnose
@@ -51,7 +52,6 @@ from bayeskin.workflow.experiment import choose
 SPREAD, MOST_TRIES = 0.25, 12
 OPENING_M, HOLD_S, REST_S, CYCLES = 6e-3, 40.0, 30.0, 2
 SECOND = ("proposed", "slow", "repeated")
-PROBABLE = 0.9
 # Groups of look-alikes, with the values of each mechanism. The first value, the strength, is drawn about it.
 GROUPS: dict[str, dict[str, dict[str, float]]] = {
     "relaxation in holds": {
@@ -142,10 +142,10 @@ def make(file: Path, skin: Skin, motion: PadMotion, purpose: int) -> None:
     rng, problem = skin.rng(purpose), problem_of(False, Geometry())
     theta = {**skin.values, "p_init": float(rng.uniform(-300.0, 1500.0))}
     mechanisms = [catalogue()[name] for name in skin.names]
-    base = {name: theta[name] for name in ("E_c", "E_s", "k_c", "k_s", "p_init")}
-    solved_values = {p.name: theta[p.name] for m in mechanisms if m.act.bind for p in m.parameters}
-    solid = material({**base, **solved_values}, problem.mesh.cutis)
-    run = simulate_on(problem, solid, TOLERANCE, motion, {**base, **solved_values}, laws(mechanisms))
+    solved_names = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
+    skin_alone = {name: value for name, value in theta.items() if name in {*PARAMETERS, *solved_names}}
+    solid = material(skin_alone, problem.mesh.cutis)
+    run = simulate_on(problem, solid, TOLERANCE, motion, skin_alone, laws(mechanisms))
     if run.status != "ok":
         raise SystemExit(f"{skin.group}, skin {skin.number}: {run.message}")
     values = {name: np.array([value]) for name, value in theta.items()}
@@ -178,10 +178,10 @@ def diagnosed(folder: Path, skin: Skin, second: str, files: Sequence[Path], bits
 
 def result_of(skin: Skin, probabilities: Mapping[str, float]) -> str:
     """Returns "right", "wrong" or "open" for the probabilities of the named mechanisms."""
-    probable = {name for name, value in probabilities.items() if value >= PROBABLE} - set(skin.names)
-    if probable & set(GROUPS[skin.group]):
+    probable = {name for name, value in probabilities.items() if value >= VerdictSettings().probable}
+    if (probable - set(skin.names)) & set(GROUPS[skin.group]):
         return "wrong"
-    return "right" if probabilities.get(skin.mechanism, 0.0) >= PROBABLE else "open"
+    return "right" if skin.mechanism in probable else "open"
 
 
 def followed(folder: Path, skin: Skin) -> bool:

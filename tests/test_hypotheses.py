@@ -143,7 +143,7 @@ def test_of_two_mechanisms_both_have_an_error() -> None:
 
 
 def test_sets_that_share_a_mechanism_share_its_error() -> None:
-    """Whether a second mechanism acts beside a certain one depends on the error of the second alone."""
+    """The probability of a second mechanism beside a certain one depends on the second's error alone."""
     said = {("sensor-drift",): 100.0, ("sensor-drift", "stiffness-drift"): 107.0}
     rows = [hypotheses_of(names, Evidences(nats, nats - 50.0)) for names, nats in said.items()]
     family = Family([hypothesis for row in rows for hypothesis in row])

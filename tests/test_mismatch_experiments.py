@@ -197,7 +197,7 @@ def judged(fits: Sequence[Fit]) -> list[Experiment]:
 
 @pytest.fixture(scope="module")
 def table() -> list[Experiment]:
-    """What each protocol tells about friction and drag, which are as likely."""
+    """Judged protocols, which tell friction from drag; both are as likely."""
     return judged([fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)])
 
 

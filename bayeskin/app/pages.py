@@ -30,12 +30,8 @@ HERE = Path(__file__).parent
 _TITLES = {key: question.title for key, question in QUESTIONS.items()}
 _TONES = {jobs.State.DONE: "good", jobs.State.RUNNING: "none", jobs.State.STOPPED: "none"}
 _FINISHED = (jobs.State.DONE, jobs.State.NOT_TRUSTED)
-_PROBLEMS = (
-    "reading",
-    "device",
-    "ask",
-    "remove",
-)  # the parts of a recording's page in which an error may stand
+# The parts of a recording's page in which an error may stand.
+_PROBLEMS = ("reading", "device", "ask", "remove")
 
 
 @cache
